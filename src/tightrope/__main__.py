@@ -1,0 +1,8 @@
+"""``python -m tightrope`` is the command line."""
+
+import sys
+
+from tightrope.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

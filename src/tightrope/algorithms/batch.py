@@ -1,0 +1,90 @@
+"""The data one update works on: rows are environments or prompts, columns are steps or tokens."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a model says of a batch: ``logp``, ``entropy`` and ``values``, each [B, T]."""
+
+    logp: Tensor
+    entropy: Tensor
+    values: Tensor
+
+    def within(self, mask: Tensor) -> Evaluation:
+        """The same with 0 outside the mask: what a model says of padding reaches no loss and no gradient."""
+        return Evaluation(*(torch.where(mask, x, 0.0) for x in (self.logp, self.entropy, self.values)))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Steps to learn from. Everything per step is [B, T]; ``mask`` is True where a step counts.
+
+    ``inputs`` is opaque: a dict of tensors whose leading axis is the row (control: [B, T, ...] observations).
+    ``actions`` is [B, T, ...]; ``old_logp`` is the sampler's own log-probability; ``returns`` = advantages + old values.
+    """
+
+    inputs: dict[str, Tensor]
+    actions: Tensor
+    old_logp: Tensor
+    old_values: Tensor
+    advantages: Tensor
+    returns: Tensor
+    mask: Tensor
+
+    def __len__(self) -> int:
+        """The number of rows."""
+        return self.mask.shape[0]
+
+    def select(self, rows: Any) -> Batch:
+        """The batch of these rows only (an index tensor or a slice)."""
+        values = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            values[field.name] = (
+                {name: leaf[rows] for name, leaf in value.items()} if isinstance(value, dict) else value[rows]
+            )
+        return Batch(**values)
+
+    def as_steps(self) -> Batch:
+        """[B, T] to [N, 1]: every counting step becomes a row of its own; masked steps are left out."""
+
+        def flat(x: Tensor) -> Tensor:
+            return x.reshape(x.shape[0] * x.shape[1], 1, *x.shape[2:])
+
+        values = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            values[field.name] = (
+                {name: flat(leaf) for name, leaf in value.items()} if isinstance(value, dict) else flat(value)
+            )
+        steps = Batch(**values)
+        return steps if bool(steps.mask.all()) else steps.select(steps.mask[:, 0].nonzero()[:, 0])
+
+    def cleared(self) -> Batch:
+        """The same with 0 in every number outside the mask: padding may hold anything, NaN included."""
+        names = ("old_logp", "old_values", "advantages", "returns")
+        return dataclasses.replace(self, **{n: torch.where(self.mask, getattr(self, n), 0.0) for n in names})
+
+    def minibatches(self, size: int, rng: np.random.Generator) -> Iterator[Batch]:
+        """All rows once, in a fresh random order, ``size`` at a time; a smaller last one is used as it is."""
+        order = torch.from_numpy(rng.permutation(len(self))).to(self.mask.device)
+        for start in range(0, len(self), size):
+            yield self.select(order[start : start + size])
+
+    def split(self, size: int | None) -> Iterator[Batch]:
+        """Consecutive parts of at most ``size`` rows (None: the batch whole); their gradients add up to the whole's."""
+        if size is None or size >= len(self):
+            yield self
+            return
+        for start in range(0, len(self), size):
+            yield self.select(slice(start, start + size))

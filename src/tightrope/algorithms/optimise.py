@@ -1,0 +1,146 @@
+"""What all update rules do alike: build Adam, take a checked step, and keep the books over every minibatch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, nn
+
+from tightrope.algorithms.settings import UpdateSettings
+from tightrope.maths import divergence, statistics, surrogate
+
+
+class NonFiniteError(FloatingPointError):
+    """A NaN or an infinity was met before a step; the weights are as they were before that step."""
+
+
+class SamplingMismatch(RuntimeError):
+    """The probabilities that trained are not the probabilities that sampled."""
+
+
+def make_optimiser(
+    parameters: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], settings: UpdateSettings
+) -> torch.optim.Adam:
+    """Adam with two groups, ``actor`` (everything else) and ``critic``, each with its own learning rate."""
+    critic = list(critic)
+    ids = {id(p) for p in critic}
+    groups = [
+        {"params": [p for p in parameters if id(p) not in ids], "lr": settings.learning_rate},
+        {"params": critic, "lr": settings.critic_learning_rate or settings.learning_rate},
+    ]
+    groups = [group for group in groups if group["params"]]
+    return torch.optim.Adam(groups, eps=settings.adam_eps, fused=True)
+
+
+def set_learning_rates(optimiser: torch.optim.Optimizer, settings: UpdateSettings) -> None:
+    """Put the present learning rates into the optimiser's groups (first actor, then critic)."""
+    critic = settings.critic_learning_rate
+    rates = [settings.learning_rate, settings.learning_rate if critic is None else critic]
+    for group, rate in zip(optimiser.param_groups, rates, strict=False):
+        group["lr"] = rate
+
+
+class Meter:
+    """Sums over every minibatch of an update, divided once at the end; nothing is read from the device before."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, Tensor] = {}
+        self._counts: dict[str, Tensor | float] = {}
+        self._extremes: dict[str, Tensor] = {}
+        self.last: dict[str, Tensor] = {}
+
+    def add(self, mask: Tensor, **per_step: Tensor) -> None:
+        """Add [B, T] quantities; steps outside the mask do not count. ``last`` holds the newest sums."""
+        for name, x in per_step.items():
+            self.add_sum(name, statistics.masked_sum(x.detach().float(), mask), mask.sum())
+
+    def add_sum(self, name: str, total: Tensor, count: Tensor | float) -> None:
+        """Add a sum and the number of things summed."""
+        key = f"train/{name}"
+        self._sums[key] = self._sums.get(key, 0) + total
+        self._counts[key] = self._counts.get(key, 0) + count
+
+    def extreme(self, name: str, x: Tensor, *, largest: bool) -> None:
+        """Keep the smallest or the largest element seen."""
+        key, pick = f"train/{name}", torch.maximum if largest else torch.minimum
+        x = x.detach().float()
+        x = x.max() if largest else x.min()
+        self._extremes[key] = pick(self._extremes[key], x) if key in self._extremes else x
+
+    def means(self) -> dict[str, float]:
+        """One read of the device: the mean of every sum, and the extremes."""
+        names = [*self._sums, *self._extremes]
+        values = [self._sums[k] / self._counts[k] for k in self._sums] + list(self._extremes.values())
+        values = [torch.as_tensor(v, dtype=torch.float64, device="cpu") for v in values]
+        return dict(zip(names, torch.stack(values).tolist(), strict=True)) if names else {}
+
+
+def book_ratios(meter: Meter, log_ratio: Tensor, mask: Tensor, clip: float, clip_high: float) -> Tensor:
+    """Book what the ratios tell of the step size; returns the sum of k3 over the counting steps."""
+    high = surrogate.clipped_high(log_ratio, clip_high) & mask
+    low = surrogate.clipped_low(log_ratio, clip) & mask
+    kl = divergence.k3(log_ratio).detach()
+    meter.add(mask, approx_kl=kl, clip_fraction=high | low, clip_fraction_high=high, clip_fraction_low=low)
+    ratio = log_ratio.detach().exp()
+    meter.extreme("ratio_min", ratio, largest=False)
+    meter.extreme("ratio_max", ratio, largest=True)
+    return statistics.masked_sum(kl, mask)
+
+
+class Brake:
+    """Decides on the device, before a step, whether it may be taken; once on, it stays on.
+
+    ``kl``: the minibatch's KL is above target_kl.  ``bad``: the gradient norm is not finite.  A fused Adam skips
+    the step by itself (its ``found_inf``), so an accelerator need not be waited for; the host looks when it polls.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.kl = torch.zeros((), dtype=torch.bool, device=device)
+        self.bad = torch.zeros((), dtype=torch.bool, device=device)
+        self.steps = torch.zeros((), dtype=torch.int64, device=device)
+        self._lazy = device.type == "cuda"
+
+    def step(self, optimiser: torch.optim.Optimizer, max_grad_norm: float | None, meter: Meter) -> None:
+        """Clip by one joint norm over all parameters and take the step, unless the brake is on."""
+        parameters = [p for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
+        norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+        self.bad = self.bad | ~torch.isfinite(norm)
+        if max_grad_norm is not None:
+            nn.utils.clip_grads_with_norm_(parameters, max_grad_norm, norm)
+        halted = self.kl | self.bad
+        self.steps += ~halted
+        fused = all(group.get("fused") for group in optimiser.param_groups)
+        if self._lazy and fused:
+            optimiser.found_inf = halted.float()  # type: ignore[attr-defined]
+            optimiser.step()
+        elif not bool(halted):
+            optimiser.step()
+        meter.add_sum("grad_norm", norm.detach(), 1.0)
+
+    def halted(self, *, poll: bool = False) -> bool:
+        """Whether to stop; raises NonFiniteError for a bad gradient. Waits for an accelerator only when polled."""
+        if self._lazy and not poll:
+            return False
+        if bool(self.bad):
+            raise NonFiniteError(
+                "The gradient holds a NaN or an infinity; that step was not taken and the weights are as before it. "
+                "Look for extreme rewards, observations or a learning rate that is too high."
+            )
+        return bool(self.kl)
+
+
+def check_first_ratios(log_ratio: Tensor, limit: float | None) -> None:
+    """Before the first step every ratio must be 1: what is sampled is what is trained.
+
+    Raises SamplingMismatch when max |log_ratio| is above ``limit`` (None: not checked).
+    """
+    if limit is None:
+        return
+    worst = float(log_ratio.detach().abs().max())
+    if not worst <= limit:
+        raise SamplingMismatch(
+            f"Before any update the log-probabilities differ by {worst:.3g} from those that sampled (limit {limit:g}). "
+            "Sampling and training disagree. Likely causes: dropout or batch normalisation left on in the policy, a "
+            "normaliser that moved between rollout and update, another temperature or action mask in training."
+        )

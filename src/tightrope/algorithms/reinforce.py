@@ -1,0 +1,71 @@
+"""REINFORCE: one step on the whole rollout along the policy gradient of Monte Carlo returns.
+
+    L = E[ -(G - b) log pi(a|s) ] - entropy_weight * H;  G = sum_k gamma^k r_{t+k}                   (Williams 1992)
+
+With a baseline, b = V(s) is learned beside it and cut episodes are continued by V; without, b = 0 and the
+steps of episodes that do not finish inside the rollout are masked. Read beside a2c.py: lambda is 1, no more.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tightrope.algorithms.batch import Batch, Evaluation
+from tightrope.algorithms.optimise import Brake, Meter, book_ratios, check_first_ratios
+from tightrope.algorithms.settings import ReinforceSettings
+from tightrope.maths import statistics, surrogate, values
+
+Model = Callable[[Batch], Evaluation]
+ExtraLoss = Callable[[Model, Batch, Evaluation], tuple[Tensor, dict[str, Tensor]]]
+
+
+def update(
+    model: Model,
+    optimiser: torch.optim.Optimizer,
+    batch: Batch,
+    settings: ReinforceSettings,
+    rng: np.random.Generator,
+    *,
+    extra_loss: ExtraLoss | None = None,
+    refresh: Callable[[Batch], Batch] | None = None,
+    log_ratio_limit: float | None = None,
+) -> dict[str, float]:
+    """Improve ``model`` on one rollout by one step; returns the metrics.
+
+    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced, metrics)``.
+    ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
+    Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the log-ratios exceed
+    ``log_ratio_limit``.
+    """
+    meter, brake, batch = Meter(), Brake(batch.mask.device), batch.cleared()
+    optimiser.zero_grad(set_to_none=True)
+    if settings.normalise_advantages:
+        advantages = statistics.standardise(batch.advantages, batch.mask)
+        batch = dataclasses.replace(batch, advantages=advantages)
+    count = batch.mask.sum()
+    for part in batch.split(settings.micro_batch_size):
+        now = model(part).within(part.mask)
+        log_ratio = surrogate.log_ratio(now.logp, part.old_logp, part.mask)
+        policy = surrogate.policy_gradient(now.logp, part.advantages)
+        value = values.squared_error(now.values, part.returns)
+        loss = policy - settings.entropy_weight * now.entropy
+        if settings.baseline:
+            loss = loss + settings.value_weight * value
+        total = statistics.masked_mean(loss, part.mask, count)
+        if extra_loss is not None:
+            extra, extra_metrics = extra_loss(model, part, now)
+            total = total + extra
+            meter.add(part.mask, **extra_metrics)
+        total.backward()
+        meter.add(part.mask, policy_gradient_loss=policy, value_loss=value, entropy=now.entropy)
+        book_ratios(meter, log_ratio, part.mask, torch.inf, torch.inf)
+        check_first_ratios(log_ratio, log_ratio_limit)
+        meter.extreme("log_ratio_first", log_ratio.abs(), largest=True)
+    brake.step(optimiser, settings.max_grad_norm, meter)
+    brake.halted(poll=True)
+    return {**meter.means(), "train/minibatches": float(brake.steps)}

@@ -1,0 +1,1 @@
+"""Story one: reinforcement learning on Gymnasium tasks."""

@@ -1,0 +1,295 @@
+"""The Python face of the control story: PPO(env).learn(n), iterate, predict, value, save, load."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from tightrope.algorithms import ppo
+from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
+from tightrope.algorithms.settings import PPOSettings
+from tightrope.control import engines
+from tightrope.control.collect import Collector, Rollout, to_batch
+from tightrope.control.environments import Environments, available_cores, make_environments
+from tightrope.control.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
+from tightrope.control.policies import Policy
+from tightrope.control.resolve import resolve
+from tightrope.control.settings import TrainSettings
+from tightrope.control.spaces import ObservationLayout
+from tightrope.control.threads import limited_threads
+from tightrope.maths.values import explained_variance
+
+Array = np.ndarray
+CRUMB = 16  # columns; ten epochs on fewer steps than this would only add noise to a finished policy
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One update of a run: agent steps so far, the budget, every metric, and the episodes that ended."""
+
+    step: int
+    total_steps: int
+    metrics: dict[str, float]
+    episodes: list[tuple[float, int, bool]]
+
+
+class Agent:
+    """A policy that learns on an environment. Use PPO, A2C or Reinforce.
+
+    ``env``: a Gymnasium id, an environment, a factory or a vector environment.  ``policy``: a torch module of your
+    own (see Policy).  Everything else is a field of TrainSettings or of the algorithm's settings, by name; what is
+    not given comes from the preset of the task.
+    """
+
+    algorithm: ClassVar[str]
+
+    def __init__(self, env: Any, *, policy: Any = None, settings: TrainSettings | None = None, **values: Any) -> None:
+        self.settings = settings or resolve(env, self.algorithm, values)
+        self.env, self._own = env, policy
+        self.environments = _environments(env, self.settings)
+        present = self.settings
+        torch_device = torch.device(present.device)
+        layouts = (self.environments.observation_layout, self.environments.action_layout)
+        self.policy = Policy(*layouts, present, policy).to(torch_device)
+        self.optimiser = make_optimiser(self.policy.parameters(), self.policy.critic_parameters(), present.update)
+        self.normalisers = _normalisers(self.environments, present)
+        self.cores = available_cores()
+        self.engine, self.engine_line = engines.choose(self.policy, self.optimiser, present, self.cores)
+        self.sampling_rng, self.update_rng = (np.random.default_rng([present.seed, k]) for k in (1, 2))
+        self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
+        self.steps, self.kl_beta = 0, getattr(present.update, "kl_beta", None)
+        self._fresh = True
+        backend = self.environments.backend if self.environments.backend != "given" else present.vector_backend
+        self.settings = dataclasses.replace(
+            present,
+            num_envs=self.environments.num_envs,
+            vector_backend=backend,
+            num_workers=self.environments.num_workers if backend == "workers" else present.num_workers,
+            engine=self.engine.name,
+            threads=present.threads or (self.cores if layouts[0].image_shapes else 1),
+        )
+
+    # ---------------------------------------------------------------------------------------------- learning
+
+    def learn(self, total_steps: int | None = None) -> Agent:
+        """Train for at most ``total_steps`` more agent steps (default: the settings'); schedules run over them."""
+        for _ in self.iterate(total_steps):
+            pass
+        return self
+
+    def iterate(self, total_steps: int | None = None, *, start: int | None = None) -> Iterator[Progress]:
+        """The same, one update at a time: ``for report in agent.iterate(n): ...``.
+
+        ``start``: the agent step at which this budget began (default: now).
+        """
+        budget = self.settings.total_steps if total_steps is None else total_steps
+        start = self.steps if start is None else start
+        if self._fresh:
+            self.collector.reset(self.settings.seed + self.steps)
+            self._fresh = False
+        first = True
+        while (columns := self._next_columns(budget - (self.steps - start), first)) > 0:
+            with limited_threads(self.settings.threads or 1):
+                metrics, episodes = self._one_update(columns, (self.steps - start) / budget, check=first)
+            first = False
+            yield Progress(self.steps - start, budget, metrics, episodes)
+
+    def _next_columns(self, remaining: int, first: bool) -> int:
+        """Columns of the next rollout, never more than the budget allows; a crumb at the end is not learned from."""
+        columns = min(self.settings.num_steps, remaining // self.environments.num_envs)
+        return columns if first or columns >= min(CRUMB, self.settings.num_steps) else 0
+
+    def _one_update(
+        self, columns: int, progress: float, *, check: bool
+    ) -> tuple[dict[str, float], list[tuple[float, int, bool]]]:
+        """collect -> advantages -> update -> statistics."""
+        present = self.settings.update.at(progress)
+        if isinstance(present, PPOSettings) and self.kl_beta is not None:
+            present = _with(present, kl_beta=self.kl_beta)
+        set_learning_rates(self.optimiser, present)
+        begin = time.perf_counter()
+        rollout = self.collector.collect(self.engine, columns)
+        collected = time.perf_counter()
+        batch = to_batch(rollout, self.engine, self.normalisers, present)
+        metrics: dict[str, float] = {}
+        if bool(batch.mask.any()):
+            limit = self._log_ratio_limit(batch) if check else None
+            metrics = self.engine.update(
+                self.optimiser,
+                batch.as_steps(),
+                present,
+                self.update_rng,
+                refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
+                log_ratio_limit=limit,
+            )
+            metrics["train/explained_variance"] = float(
+                explained_variance(batch.old_values, batch.returns, batch.mask)
+            )
+        if isinstance(present, PPOSettings) and present.kl_beta is not None and present.kl_adapt is not None:
+            self.kl_beta = ppo.next_kl_beta(present.kl_beta, metrics["train/approx_kl"], present.kl_adapt)
+        self.normalisers.update(rollout)
+        self.steps += rollout.steps
+        finish = time.perf_counter()
+        metrics |= _settings_metrics(present) | _episode_metrics(rollout)
+        metrics |= {"time/env_seconds": collected - begin, "time/update_seconds": finish - collected}
+        metrics["time/fps"] = rollout.steps / (finish - begin)
+        return metrics, rollout.episodes
+
+    def _log_ratio_limit(self, batch: Batch) -> float:
+        """1e-5, times what rounding in float32 grows with: columns, the size of inputs, a small deviation."""
+        scale = float(max(1, self.environments.action_layout.num_columns))
+        if "flat" in batch.inputs:
+            scale *= max(1.0, float(batch.inputs["flat"].abs().max()))
+        if self.policy.log_std is not None:
+            scale /= min(1.0, float(self.policy.log_std.detach().min().exp()))
+        return 1e-5 * scale
+
+    # ------------------------------------------------------------------------------------------------ acting
+
+    def predict(
+        self, observation: Any, deterministic: bool = True, *, action_masks: Any = None
+    ) -> tuple[Any, None]:
+        """Action(s) for one observation or a batch, in the task's own form; the second item is always None.
+
+        ``deterministic``: the most likely action, else a sampled one.
+        """
+        layout, actions = self.environments.observation_layout, self.environments.action_layout
+        batched = _is_batched(layout, observation)
+        inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
+        rows = len(next(iter(inputs.values())))
+        if action_masks is not None:
+            inputs = {**inputs, "action_mask": actions.flatten_mask(action_masks, rows)}
+        elif layout.has_mask:
+            inputs = {**inputs, "action_mask": actions.flatten_mask(layout.mask_of(observation), rows)}
+        tensors = {k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()}
+        if deterministic:
+            chosen = self.policy.mode(tensors)
+        else:
+            noise = self.noise(rows, self.sampling_rng)
+            if self.policy.gsde:
+                self.policy.hold_exploration(rows, self.sampling_rng)
+            chosen = self.policy.act(tensors, noise)[0]
+        matrix = chosen.cpu().numpy()
+        squash = self.settings.squash
+        return (actions.to_env(matrix, squash) if batched else actions.to_env_single(matrix[0], squash)), None
+
+    def value(self, observation: Any) -> Any:
+        """The critic's V(s) in units of the return: a float for one observation, an array [N] for a batch."""
+        layout = self.environments.observation_layout
+        batched = _is_batched(layout, observation)
+        inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
+        tensors = {k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()}
+        with torch.no_grad():
+            values = self.policy.values(tensors).cpu().numpy()
+        values = values * (self.normalisers.rewards.deviation if self.normalisers.rewards is not None else 1.0)
+        return values if batched else float(values[0])
+
+    def noise(self, rows: int, rng: np.random.Generator) -> torch.Tensor:
+        """Noise [rows, A] for Policy.act."""
+        return torch.from_numpy(self.collector.noise(1, rows, rng)[0]).to(self.policy.device)
+
+    # ---------------------------------------------------------------------------------------- moving and saving
+
+    def set_env(self, env: Any) -> Agent:
+        """Go on learning on another environment with the same spaces (a warm start)."""
+        self.environments.close()
+        fresh = _environments(env, self.settings)
+        old = self.environments
+        for name in ("observation_layout", "action_layout"):
+            seen, expected = getattr(fresh, name).space, getattr(old, name).space
+            if seen != expected:
+                fresh.close()
+                raise ValueError(f"The new environment has {name[:-7]}s {seen}; this policy was made for {expected}.")
+        self.env, self.environments = env, fresh
+        if self.normalisers.rewards is not None:
+            self.normalisers.rewards.restart(fresh.num_envs)
+        self.collector = Collector(fresh, self.normalisers, self.sampling_rng)
+        self.settings = dataclasses.replace(self.settings, env=fresh.spec_id, num_envs=fresh.num_envs)
+        self._fresh = True
+        return self
+
+    def save(self, path: str | Path) -> Path:
+        """Write policy, optimiser, normalisers and random generators into the folder ``path``; nothing is pickled."""
+        from tightrope.control.saving import save_agent
+
+        return save_agent(self, Path(path))
+
+    def close(self) -> None:
+        """Close the environments and end their workers."""
+        self.environments.close()
+
+
+class PPO(Agent):
+    """Proximal policy optimisation on a Gymnasium task."""
+
+    algorithm = "ppo"
+
+
+class A2C(Agent):
+    """Synchronous advantage actor-critic on a Gymnasium task."""
+
+    algorithm = "a2c"
+
+
+class Reinforce(Agent):
+    """REINFORCE, with (default) or without a baseline, on a Gymnasium task."""
+
+    algorithm = "reinforce"
+
+
+AGENTS: dict[str, type[Agent]] = {"ppo": PPO, "a2c": A2C, "reinforce": Reinforce}
+
+
+def _environments(env: Any, settings: TrainSettings) -> Environments:
+    source = settings.env if env is None else env
+    backend, workers = settings.vector_backend, settings.num_workers
+    return make_environments(source, settings.num_envs, backend=backend, num_workers=workers, squash=settings.squash)
+
+
+def _normalisers(environments: Environments, settings: TrainSettings) -> Normalisers:
+    layout = environments.observation_layout
+    observations = ObservationNormaliser(layout.continuous) if settings.normalise_observations and layout.size else None
+    rewards = RewardNormaliser(environments.num_envs, settings.update.gamma) if settings.normalise_rewards else None
+    return Normalisers(observations, rewards)
+
+
+def _is_batched(layout: ObservationLayout, observation: Any) -> bool:
+    """Whether an observation has one axis more than the space says."""
+    leaf = layout.leaves[0]
+    for key in leaf.path:
+        observation = observation[key]
+    return np.ndim(observation) > len(leaf.space.shape or ())
+
+
+def _with(settings: Any, **values: Any) -> Any:
+    """A copy with these values that is not checked again: present values may lie at the edge of a range."""
+    copy = object.__new__(type(settings))
+    for field in dataclasses.fields(settings):
+        object.__setattr__(copy, field.name, values.get(field.name, getattr(settings, field.name)))
+    return copy
+
+
+def _settings_metrics(present: Any) -> dict[str, float]:
+    names = ("learning_rate", "critic_learning_rate", "clip", "entropy_weight", "kl_beta")
+    found = {f"train/{name}": getattr(present, name, None) for name in names}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _episode_metrics(rollout: Rollout) -> dict[str, float]:
+    if not rollout.episodes:
+        return {"rollout/episodes": 0.0}
+    return {
+        "rollout/ep_rew_mean": float(np.mean([e[0] for e in rollout.episodes])),
+        "rollout/ep_len_mean": float(np.mean([e[1] for e in rollout.episodes])),
+        "rollout/episodes": float(len(rollout.episodes)),
+    }
+
+

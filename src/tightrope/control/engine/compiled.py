@@ -1,0 +1,217 @@
+"""How the engine's functions are compiled: flags, cache folder, and the few instructions numba has no words for.
+
+Never ``fastmath=True``: it promises the compiler that no NaN exists and makes every isnan and isfinite false.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding as llvm
+import numba
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import get_cython_function_address, intrinsic
+from numba.np import arrayobj
+
+FLAGS = {"contract", "reassoc", "arcp", "nsz", "afn"}
+SWITCH = "TIGHTROPE_NUMBA_CACHE"
+
+# Sums and products over rows: the compiler may reorder them (always in the same way).
+kernel = numba.njit(nogil=True, error_model="numpy", fastmath=FLAGS)
+# Element functions whose rounding steps carry their accuracy: only a multiply and its addition may be fused.
+element = numba.njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+
+llvm.add_symbol("tightrope_sgemm", get_cython_function_address("scipy.linalg.cython_blas", "sgemm"))
+_LIBRARY = ctypes.WinDLL("kernel32") if sys.platform == "win32" else ctypes.CDLL(None)
+_YIELD = _LIBRARY.SwitchToThread if sys.platform == "win32" else _LIBRARY.sched_yield
+llvm.add_symbol("tightrope_yield", ctypes.cast(_YIELD, ctypes.c_void_p).value)
+
+
+def cache_folder() -> Path | None:
+    """Where compiled code is kept, 0700 below the user's cache directory; None when switched off or not safe.
+
+    The name of the last folder stands for everything the machine code depends on: these sources, numba, the CPU.
+    """
+    if os.environ.get(SWITCH, "").lower() in ("off", "0", "no", "none"):
+        return None
+    state = hashlib.sha256()
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        state.update(source.read_bytes())
+    machine = (llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), platform.machine())
+    state.update(repr((numba.__version__, llvmlite.__version__, sys.version, machine)).encode())
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    root = base / "tightrope" / "numba"
+    folder = root / state.hexdigest()[:16]
+    try:
+        base.mkdir(parents=True, exist_ok=True)
+        for part in (base / "tightrope", root, folder):
+            part.mkdir(mode=0o700, exist_ok=True)
+        for part in (root, folder):
+            if hasattr(os, "getuid") and part.stat().st_uid != os.getuid():
+                return None  # what lies there was not written by this user and would be executed
+            part.chmod(0o700)
+    except OSError:
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def compilation_due() -> bool:
+    """Whether loading the engine will compile it (many seconds) and not read it from the cache (under one)."""
+    folder = cache_folder()
+    return folder is None or not (folder / "complete").exists()
+
+
+def mark_complete() -> None:
+    """Note in the cache that everything has been compiled."""
+    folder = cache_folder()
+    if folder is not None:
+        (folder / "complete").touch(mode=0o600)
+
+
+def entry(signature: str) -> Callable[[Any], Any]:
+    """Compile a function that Python calls, with this signature alone, now or from the cache."""
+    folder = cache_folder()
+
+    def compile_now(function: Any) -> Any:
+        earlier = numba.config.CACHE_DIR
+        numba.config.CACHE_DIR = "" if folder is None else str(folder)  # read when the cache of a function is made
+        try:
+            options = {"nogil": True, "error_model": "numpy", "fastmath": FLAGS}
+            return numba.njit(signature, cache=folder is not None, **options)(function)
+        finally:
+            numba.config.CACHE_DIR = earlier
+
+    return compile_now
+
+
+def _pointer(context: Any, builder: Any, kind: Any, array: Any, offset: Any) -> Any:
+    return builder.gep(context.make_array(kind)(context, builder, array).data, [offset])
+
+
+@intrinsic
+def row(typing: Any, array: Any, offset: Any, count: Any) -> Any:
+    """``array[offset : offset + count]`` of a contiguous vector, without checks, wraparound or reference counts."""
+    kind = types.Array(array.dtype, 1, "C")
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, offset, count = arguments
+        view = context.make_array(kind)(context, builder)
+        size = context.get_constant(types.intp, 4 if signature.args[0].dtype == types.float32 else 8)
+        data = _pointer(context, builder, signature.args[0], array, offset)
+        arrayobj.populate_array(view, data, (count,), (size,), size, meminfo=None)
+        return view._getvalue()
+
+    return kind(array, types.intp, types.intp), generate
+
+
+@intrinsic
+def gemm(typing: Any, ta: Any, tb: Any, m: Any, n: Any, k: Any, a: Any, b: Any, beta: Any, c: Any) -> Any:
+    """BLAS sgemm, column-major: C [m, n] = op(A) op(B) + beta C; a, b, c are (vector, offset, leading dimension)."""
+    signature = types.void(types.boolean, types.boolean, types.intp, types.intp, types.intp, a, b, types.float32, c)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        integer, real, byte = ir.IntType(32), ir.FloatType(), ir.IntType(8)
+        ta, tb, m, n, k, a, b, beta, c = arguments
+
+        def address(value: Any) -> Any:
+            slot = cgutils.alloca_once(builder, value.type)
+            builder.store(value, slot)
+            return slot
+
+        def matrix(value: Any, kind: Any) -> tuple[Any, Any]:
+            vector, offset, leading = cgutils.unpack_tuple(builder, value)
+            offset = context.cast(builder, offset, kind[1], types.intp)
+            leading = context.cast(builder, leading, kind[2], types.intp)
+            data = _pointer(context, builder, kind[0], vector, offset)
+            return data, address(builder.trunc(leading, integer))
+
+        def letter(flag: Any) -> Any:
+            return address(builder.select(flag, ir.Constant(byte, ord("T")), ir.Constant(byte, ord("N"))))
+
+        kinds = signature.args
+        (pa, lda), (pb, ldb), (pc, ldc) = matrix(a, kinds[5]), matrix(b, kinds[6]), matrix(c, kinds[8])
+        sizes = [address(builder.trunc(value, integer)) for value in (m, n, k)]
+        one = address(ir.Constant(real, 1.0))
+        actual = [letter(ta), letter(tb), *sizes, one, pa, lda, pb, ldb, address(beta), pc, ldc]
+        kind = ir.FunctionType(ir.VoidType(), [value.type for value in actual])
+        builder.call(cgutils.get_or_insert_function(builder.module, kind, "tightrope_sgemm"), actual)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def float_of_bits(typing: Any, bits: Any) -> Any:
+    """The float32 that has these 32 bits."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.int32), generate
+
+
+@intrinsic
+def bits_of_float(typing: Any, number: Any) -> Any:
+    """The 32 bits of a float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(32))
+
+    return types.int32(types.float32), generate
+
+
+@intrinsic
+def load_shared(typing: Any, array: Any, index: Any) -> Any:
+    """Read an int64 that another thread writes; what it wrote before is visible after (acquire)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load_atomic(_pointer(context, builder, signature.args[0], *arguments), "acquire", 8)
+
+    return types.int64(array, types.intp), generate
+
+
+@intrinsic
+def store_shared(typing: Any, array: Any, index: Any, value: Any) -> Any:
+    """Write an int64 that another thread reads, after everything written before it (release)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, index, value = arguments
+        builder.store_atomic(value, _pointer(context, builder, signature.args[0], array, index), "release", 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.int64), generate
+
+
+@intrinsic
+def pause(typing: Any) -> Any:
+    """Tell the core that this is a waiting loop (x86; elsewhere nothing)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if platform.machine().lower() in ("x86_64", "amd64", "i386", "i686"):
+            kind = ir.FunctionType(ir.VoidType(), [])
+            builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.sse2.pause"), [])
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@intrinsic
+def give_way(typing: Any) -> Any:
+    """Let another thread have this core."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(ir.IntType(32), [])
+        builder.call(cgutils.get_or_insert_function(builder.module, kind, "tightrope_yield"), [])
+        return context.get_dummy_value()
+
+    return types.void(), generate

@@ -1,0 +1,87 @@
+"""Two threads in one minibatch: each owns half of the parameters, and they meet at the joint gradient norm.
+
+A meeting is a counter per thread, written with release and read with acquire. A thread that waits spins for a while
+and then gives its core away; it stops waiting when the other has left. Nothing here can change a bit of the result.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from tightrope.control.engine.compiled import give_way, kernel, load_shared, pause, store_shared
+
+# entries of ``control`` (int64), each on a cache line of its own; role 0 is the actor's thread, role 1 the critic's
+ARRIVED, LEFT, EPOCH = 0, 32, 48
+LINE = 16
+CONTROL_SIZE = 64
+SPINS = 300
+
+
+@kernel
+def wait(control, index, count):
+    """Wait until ``control[index]`` has reached ``count``; False when the other thread has left for good."""
+    spins = 0
+    while load_shared(control, index) < count:
+        if load_shared(control, LEFT) != 0 and load_shared(control, index) < count:
+            return False
+        spins += 1
+        if spins < SPINS:
+            pause()
+        else:
+            give_way()
+    return True
+
+
+@kernel
+def meet(control, role):
+    """Arrive, and wait for the other; False when the other has left."""
+    count = load_shared(control, ARRIVED + LINE * role) + 1
+    store_shared(control, ARRIVED + LINE * role, count)
+    return wait(control, ARRIVED + LINE * (1 - role), count)
+
+
+class Helper:
+    """A thread that runs the critic's half of updates; made when first needed, also again after a fork."""
+
+    def __init__(self) -> None:
+        self._thread: threading.Thread | None = None
+        self._process = 0
+        self._jobs: queue.SimpleQueue[tuple[Callable[[], object], np.ndarray] | None] = queue.SimpleQueue()
+        self.error: BaseException | None = None
+
+    def start(self, job: Callable[[], object], control: np.ndarray) -> bool:
+        """Have ``job`` run beside the caller; False when no thread can be had. ``control[LEFT]`` tells its end."""
+        if self._thread is None or self._process != os.getpid() or not self._thread.is_alive():
+            self._jobs, self._process = queue.SimpleQueue(), os.getpid()
+            thread = threading.Thread(target=_serve, args=(self, self._jobs), name="tightrope-critic", daemon=True)
+            try:
+                thread.start()
+            except RuntimeError:  # the system grants no more threads
+                return False
+            self._thread = thread
+        self.error = None
+        self._jobs.put((job, control))
+        return True
+
+    def stop(self) -> None:
+        """End the thread."""
+        if self._thread is not None and self._process == os.getpid():
+            self._jobs.put(None)
+        self._thread = None
+
+
+def _serve(helper: Helper, jobs: queue.SimpleQueue) -> None:
+    while (task := jobs.get()) is not None:
+        job, control = task
+        try:
+            job()
+        except BaseException as error:  # whatever it was, the other thread must not wait for this one
+            helper.error = error
+        finally:
+            control[LEFT] = 1
+            del task, job, control

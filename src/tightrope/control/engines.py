@@ -1,0 +1,157 @@
+"""Who computes: torch, which covers everything and is the truth, or the compiled CPU engine, which repeats it.
+
+Both have the same face: ``act``, ``values``, ``gae`` and ``update``. The choice is a pure function of the settings.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from tightrope.algorithms import a2c, ppo, reinforce
+from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.settings import UpdateSettings
+from tightrope.control.normalise import CLIP, ObservationNormaliser
+from tightrope.control.policies import Policy
+from tightrope.control.settings import TrainSettings
+from tightrope.maths import returns
+
+Array = np.ndarray
+ALGORITHMS = {"ppo": ppo, "a2c": a2c, "reinforce": reinforce}
+
+
+class TorchEngine:
+    """The torch path: any policy, any device, every setting."""
+
+    name = "torch"
+
+    def __init__(self, policy: Policy, settings: TrainSettings) -> None:
+        self.policy, self.algorithm = policy, ALGORITHMS[settings.algorithm]
+        self.gsde_steps = settings.gsde_steps
+        self.device = policy.device
+        mode = "reduce-overhead" if self.device.type == "cuda" else "default"  # the former uses CUDA graphs
+        self.model = torch.compile(policy, mode=mode) if settings.compile else policy
+        self._act_count = 0
+
+    def begin_rollout(self, num_envs: int, rng: np.random.Generator) -> None:
+        """Remember what gSDE draws its matrices from."""
+        self._num_envs, self._rng = num_envs, rng
+
+    def act(
+        self,
+        inputs: dict[str, Array],
+        normaliser: ObservationNormaliser | None,
+        action_mask: Array | None,
+        noise: Array,
+        rollout: Any,
+        t: int,
+    ) -> None:
+        """Fill column ``t`` of the rollout: inputs as seen, actions and their log-probabilities."""
+        if self.policy.gsde:
+            if self._act_count % self.gsde_steps == 0:
+                self.policy.hold_exploration(self._num_envs, self._rng)
+            self._act_count += 1
+        for name, x in inputs.items():
+            seen = normaliser(x) if normaliser is not None and name == "flat" else x
+            rollout.inputs[name][:, t] = seen
+        tensors = self._tensors({name: rollout.inputs[name][:, t] for name in rollout.inputs})
+        actions, logp = self.policy.act(tensors, torch.from_numpy(noise).to(self.device))
+        rollout.actions[:, t], rollout.logp[:, t] = actions.cpu().numpy(), logp.cpu().numpy()
+
+    @torch.no_grad()
+    def values(self, inputs: dict[str, Array]) -> Array:
+        """Values [N] of encoded observations [N, ...], in one pass (images in parts, to save memory)."""
+        total = len(next(iter(inputs.values())))
+        size = 1024 if any(name.startswith("image") for name in inputs) else total
+        parts = [self._tensors({n: x[i : i + size] for n, x in inputs.items()}) for i in range(0, total, size)]
+        return torch.cat([self.policy.values(part) for part in parts]).float().cpu().numpy()
+
+    def gae(
+        self,
+        rewards: Array,
+        values: Array,
+        next_values: Array,
+        terminated: Array,
+        ended: Array,
+        mask: Array,
+        gamma: float,
+        gae_lambda: float,
+    ) -> Array:
+        """maths.returns.gae on arrays."""
+        tensors = [torch.from_numpy(np.ascontiguousarray(x)) for x in (rewards, values, next_values, terminated, ended)]
+        return returns.gae(*tensors, gamma, gae_lambda, torch.from_numpy(mask)).numpy()
+
+    def update(
+        self, optimiser: torch.optim.Optimizer, batch: Batch, settings: UpdateSettings, rng: np.random.Generator, **more: Any
+    ) -> dict[str, float]:
+        """The algorithm's update on torch."""
+        return self.algorithm.update(self.model, optimiser, batch, settings, rng, **more)
+
+    def _tensors(self, inputs: dict[str, Array]) -> dict[str, torch.Tensor]:
+        return {name: torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for name, x in inputs.items()}
+
+
+class CompiledEngine:
+    """The compiled path, on the very memory of the torch parameters and of torch's Adam."""
+
+    name = "fused"
+    device = torch.device("cpu")
+
+    def __init__(self, policy: Policy, optimiser: torch.optim.Optimizer, threads: int) -> None:
+        from tightrope.control.engine import FusedEngine
+
+        self.policy = policy
+        self.fused = FusedEngine(policy, optimiser, threads)
+        self.gae = self.fused.gae
+
+    def begin_rollout(self, num_envs: int, rng: np.random.Generator) -> None:
+        """Nothing to prepare."""
+
+    def act(
+        self,
+        inputs: dict[str, Array],
+        normaliser: ObservationNormaliser | None,
+        action_mask: Array | None,
+        noise: Array,
+        rollout: Any,
+        t: int,
+    ) -> None:
+        """Fill column ``t`` of the rollout: inputs as seen, actions and their log-probabilities."""
+        mean, inverse_std = (None, None) if normaliser is None else (normaliser.mean, normaliser.inverse_std)
+        columns = (rollout.actions[:, t], rollout.logp[:, t], rollout.inputs["flat"][:, t])
+        self.fused.act(inputs["flat"], mean, inverse_std, CLIP, action_mask, noise, *columns)
+
+    def values(self, inputs: dict[str, Array]) -> Array:
+        """Values [N] of encoded observations."""
+        return self.fused.values(inputs["flat"])
+
+    def update(
+        self, optimiser: torch.optim.Optimizer, batch: Batch, settings: UpdateSettings, rng: np.random.Generator, **more: Any
+    ) -> dict[str, float]:
+        """ppo.update, compiled."""
+        return self.fused.update(self.policy, optimiser, batch, settings, rng, **more)
+
+
+def choose(
+    policy: Policy, optimiser: torch.optim.Optimizer, settings: TrainSettings, cores: int
+) -> tuple[TorchEngine | CompiledEngine, str]:
+    """The engine for these settings, and a line that says which and why.
+
+    Raises ValueError when ``engine`` is ``fused`` and the compiled engine does not cover the settings.
+    """
+    if settings.engine == "torch":
+        return TorchEngine(policy, settings), "engine: torch, as asked"
+    from tightrope.control.engine import unsupported
+
+    reason = unsupported(policy, settings.update, policy.device, settings.algorithm)
+    if reason is None and settings.compile:
+        reason = "--compile"
+    if reason is None:
+        return CompiledEngine(policy, optimiser, threads=min(2, cores)), "engine: fused (compiled for this CPU)"
+    if settings.engine == "fused":
+        raise ValueError(
+            f"engine is 'fused', which does not cover {reason}. Use --engine auto or torch, or change that setting."
+        )
+    return TorchEngine(policy, settings), f"engine: torch (the compiled engine does not cover {reason})"

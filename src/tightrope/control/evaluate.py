@@ -1,0 +1,122 @@
+"""Episodes with a frozen policy: mean, deviation and 95 % interval of the return."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from tightrope.control.environments import Environments, make_environments
+
+Array = np.ndarray
+EVALUATION_SEED = 1_000_003  # far from training's seeds, which start at settings.seed
+MAX_COPIES = 10
+
+
+def evaluate_agent(
+    agent: Any,
+    environments: Environments,
+    episodes: int = 10,
+    *,
+    seed: int = EVALUATION_SEED,
+    deterministic: bool = True,
+) -> dict[str, Any]:
+    """Returns and lengths of ``episodes`` episodes; normalisers and weights are not touched.
+
+    Every copy plays its own fixed share of the episodes, so that short episodes are not counted more often than
+    long ones. Gives ``mean_return``, ``std_return``, ``ci95`` (half width), ``mean_length``, ``episodes``, ``returns``.
+    """
+    rows = environments.num_envs
+    share = np.array([episodes // rows + (i < episodes % rows) for i in range(rows)])
+    rng = np.random.default_rng([seed, 3])
+    inputs, action_mask = environments.reset(seed)
+    totals, lengths = np.zeros(rows), np.zeros(rows, np.int64)
+    found: list[tuple[float, int]] = []
+    while share.any():
+        actions = act(agent, inputs, action_mask, None if deterministic else rng)
+        step = environments.step(actions)
+        real = np.ones(rows, bool) if step.phantom is None else ~step.phantom
+        totals += np.where(real, step.rewards, 0.0)
+        lengths += real
+        for row in np.flatnonzero((step.terminated | step.truncated) & real):
+            if share[row]:
+                found.append((float(totals[row]), int(lengths[row])))
+                share[row] -= 1
+            totals[row], lengths[row] = 0.0, 0
+        inputs, action_mask = step.inputs, step.action_mask
+    return _summary(found)
+
+
+def act(agent: Any, inputs: dict[str, Array], action_mask: Array | None, rng: np.random.Generator | None) -> Array:
+    """Action matrix [N, A] for raw encoded inputs; ``rng`` None: the most likely actions."""
+    inputs = agent.normalisers.encode(inputs)
+    if action_mask is not None:
+        inputs = {**inputs, "action_mask": action_mask}
+    policy = agent.policy
+    tensors = {k: torch.from_numpy(np.ascontiguousarray(x)).to(policy.device) for k, x in inputs.items()}
+    if rng is None:
+        return policy.mode(tensors).cpu().numpy()
+    rows = len(next(iter(inputs.values())))
+    if policy.gsde:
+        policy.hold_exploration(rows, rng)
+    return policy.act(tensors, agent.noise(rows, rng))[0].cpu().numpy()
+
+
+def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:
+    returns = np.array([episode[0] for episode in found])
+    std = float(returns.std(ddof=1)) if len(returns) > 1 else 0.0
+    return {
+        "mean_return": float(returns.mean()),
+        "std_return": std,
+        "ci95": 1.96 * std / math.sqrt(len(returns)),
+        "mean_length": float(np.mean([episode[1] for episode in found])),
+        "episodes": len(found),
+        "returns": [float(x) for x in returns],
+    }
+
+
+def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environments:
+    """Copies for evaluation, in this process: at most MAX_COPIES, apart from those that train.
+
+    Raises ValueError when the environment cannot be made a second time (a vector environment, say).
+    """
+    if hasattr(env, "single_observation_space"):
+        raise ValueError("A vector environment cannot be copied for evaluation; pass a Gymnasium id or a factory.")
+    source = settings.env if env is None else env
+    backend = settings.vector_backend if settings.vector_backend in ("vector", "envpool") else "serial"
+    if hasattr(source, "observation_space"):  # an instance trains already: evaluation needs copies, not it
+        from tightrope.control.environments import replicate
+
+        source = replicate(source)
+    return make_environments(source, min(episodes, MAX_COPIES), backend=backend, squash=settings.squash)
+
+
+def evaluate_run(
+    path: str | Path,
+    *,
+    episodes: int = 100,
+    stochastic: bool = False,
+    best: bool = False,
+    seed: int | None = None,
+    env: Any = None,
+    policy: Any = None,
+    device: str = "cpu",
+) -> dict[str, Any]:
+    """Evaluate the policy of a run or of a saved folder; see evaluate_agent."""
+    from tightrope.control.saving import load
+
+    agent = load(path, env=env, policy=policy, best=best, device=device)
+    try:
+        environments = evaluation_environments(agent.env, agent.settings, episodes)
+        seed = EVALUATION_SEED if seed is None else seed
+        result = evaluate_agent(agent, environments, episodes, seed=seed, deterministic=not stochastic)
+        environments.close()
+    finally:
+        agent.close()
+    return {**result, "step": agent.steps, "seed": seed, "deterministic": not stochastic}
+
+

@@ -1,0 +1,65 @@
+"""From what the user said to complete settings: defaults < preset of the task < settings file < flags."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tightrope.control.presets import BY_TASK, preset
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+
+
+def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None = None) -> TrainSettings:
+    """The settings for a task (a Gymnasium id, an environment, a factory or a vector environment).
+
+    Raises ValueError for values out of range and for names that the algorithm does not know.
+    """
+    values = dict(overrides or {})
+    algorithm = values.pop("algorithm", algorithm)
+    if algorithm not in ALGORITHM_SETTINGS:
+        raise ValueError(f"algorithm is {algorithm!r}; expected one of: {', '.join(ALGORITHM_SETTINGS)}.")
+    env_id = env if isinstance(env, str) else _name_of(env)
+    if env_id in BY_TASK[algorithm]:
+        chosen = preset(env_id, algorithm)
+    else:
+        chosen = preset(env_id, algorithm, *_describe(env))
+    num_envs = getattr(env, "num_envs", None)  # a vector environment has its own number of copies
+    if num_envs is not None:
+        chosen["num_envs"] = int(num_envs)
+    rollout = {**chosen, **values}
+    steps = rollout.get("num_envs", 8) * rollout.get("num_steps", 256)
+    if "minibatch_size" in chosen and "minibatch_size" not in values:
+        chosen["minibatch_size"] = min(chosen["minibatch_size"], steps)
+    elif algorithm == "ppo" and "minibatch_size" not in values:
+        chosen["minibatch_size"] = min(64, steps)
+    base = TrainSettings(env=env_id, algorithm=algorithm, update=ALGORITHM_SETTINGS[algorithm]())  # type: ignore[arg-type]
+    return base.with_values(**{**chosen, **values})
+
+
+def _name_of(env: Any) -> str:
+    """The id of an environment object, else the name of its class or of the factory."""
+    spec = getattr(env, "spec", None)
+    if spec is not None and getattr(spec, "id", None):
+        return str(spec.id)
+    return getattr(env, "__name__", None) or type(env).__name__
+
+
+def _describe(env: Any) -> tuple[str, int | None]:
+    """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
+    from tightrope.control.environments import make_environments
+    from tightrope.control.spaces import action_layout, observation_layout
+
+    vector = hasattr(env, "single_observation_space")
+    if vector or hasattr(env, "observation_space"):
+        observations = observation_layout(env.single_observation_space if vector else env.observation_space)
+        actions = action_layout(env.single_action_space if vector else env.action_space)
+        limit = getattr(getattr(env, "spec", None), "max_episode_steps", None)
+    else:
+        backend = "vector" if isinstance(env, str) and env.startswith("ALE/") else "serial"
+        environments = make_environments(env, 1, backend=backend)
+        observations, actions = environments.observation_layout, environments.action_layout
+        limit = environments.max_episode_steps
+        environments.close()
+    if observations.image_shapes:
+        return "images", limit
+    continuous = all(component.kind == "gaussian" for component in actions.components)
+    return ("continuous" if continuous else "discrete"), limit

@@ -1,0 +1,103 @@
+"""Agents on disk: everything an agent needs to act, learn on or be resumed, as tensors and JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.settings import settings_from_json, settings_to_json
+from tightrope.runs import checkpoint
+
+
+def save_agent(agent: Agent, folder: Path, *, extra: dict[str, Any] | None = None) -> Path:
+    """Write the agent into ``folder`` as safetensors and JSON; ``extra`` goes into its state."""
+    tensors = {"policy": dict(agent.policy.state_dict()), "optimiser": _optimiser_tensors(agent.optimiser)}
+    normalisers = agent.normalisers.state()
+    if normalisers:
+        tensors["normalisers"] = normalisers
+    state = {
+        "settings": settings_to_json(agent.settings),
+        "steps": agent.steps,
+        "kl_beta": agent.kl_beta,
+        "own_policy": agent.policy.own is not None,
+        "own_environment": agent.env is not None and not isinstance(agent.env, str),
+        "rng": {"sampling": agent.sampling_rng.bit_generator.state, "update": agent.update_rng.bit_generator.state},
+        **(extra or {}),
+    }
+    return checkpoint.save(folder, tensors, state)
+
+
+def load(
+    path: str | Path, *, env: Any = None, policy: Any = None, best: bool = False, device: str | None = None
+) -> Agent:
+    """The agent of a run folder (its newest policy, ``best``: its best) or of a folder that ``save`` wrote.
+
+    ``env``: needed when the saved one was no plain Gymnasium id; another id is a warm start.  ``policy``: needed when
+    the saved policy was a module of your own.
+    """
+    folder = agent_folder(Path(path), best=best)
+    tensors, state = checkpoint.load(folder)
+    settings = settings_from_json(state["settings"])
+    if device is not None:
+        settings = settings.with_values(device=device)
+    if state["own_policy"] and policy is None:
+        raise ValueError(f"{path} holds a policy module of your own. Pass it again: load({str(path)!r}, policy=module).")
+    if env is None and (state["own_environment"] or ":" in settings.env):
+        raise ValueError(
+            f"{path} was trained on {settings.env!r}, which no file may import. Pass it again: "
+            f"load({str(path)!r}, env=...), or on the command line --env-module FILE.py."
+        )
+    if isinstance(env, str):
+        settings = dataclasses.replace(settings, env=env, vector_backend="auto", num_workers=None)
+    agent = AGENTS[settings.algorithm](env if env is not None else settings.env, policy=policy, settings=settings)
+    restore(agent, tensors, state)
+    return agent
+
+
+def agent_folder(path: Path, *, best: bool = False) -> Path:
+    """The checkpoint folder inside a run, or the path itself when it is one. Raises ValueError when there is none."""
+    if (path / "manifest.json").is_file():
+        return path
+    from tightrope.runs.run import Run
+
+    run = Run.open(path)
+    if not best:
+        return run.newest_checkpoint()
+    if not run.best.is_dir():
+        raise ValueError(f"{path} has no best policy: no evaluation took place. Leave --best out.")
+    return run.best
+
+
+def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: dict[str, Any]) -> None:
+    """Put saved tensors and counters into an agent of the same settings."""
+    agent.policy.load_state_dict(tensors["policy"])
+    _restore_optimiser(agent.optimiser, tensors["optimiser"])
+    normalisers = dict(tensors.get("normalisers", {}))
+    running = normalisers.get("rewards.running")
+    if running is not None and len(running) != agent.environments.num_envs:
+        normalisers["rewards.running"] = torch.zeros(agent.environments.num_envs, dtype=torch.float64)
+    agent.normalisers.load(normalisers)
+    agent.steps, agent.kl_beta = int(state["steps"]), state["kl_beta"]
+    agent.sampling_rng.bit_generator.state = state["rng"]["sampling"]
+    agent.update_rng.bit_generator.state = state["rng"]["update"]
+
+
+def _optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
+    state = optimiser.state_dict()["state"]
+    return {f"{index}.{name}": x for index, entry in state.items() for name, x in entry.items()}
+
+
+def _restore_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, torch.Tensor]) -> None:
+    """Adam's moments, copied in place where they exist: the compiled engine may hold views of them."""
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    for name, saved in tensors.items():
+        index, kind = name.split(".", 1)
+        entry = optimiser.state[parameters[int(index)]]
+        if kind in entry:
+            entry[kind].copy_(saved)
+        else:
+            entry[kind] = saved.to(parameters[int(index)].device).clone()

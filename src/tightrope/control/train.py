@@ -1,0 +1,174 @@
+"""``tightrope train`` and ``tightrope resume``: the loop around an agent that leaves a run folder behind."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.evaluate import evaluate_agent, evaluation_environments
+from tightrope.control.resolve import resolve
+from tightrope.control.saving import restore, save_agent
+from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
+from tightrope.runs import checkpoint
+from tightrope.runs.run import Run
+
+__all__ = ["resolve", "resume", "train"]
+
+Reporter = Callable[[str, dict[str, Any]], None]
+
+
+def _silent(event: str, data: dict[str, Any]) -> None:
+    """The reporter that says nothing."""
+
+
+def train(
+    settings: TrainSettings,
+    *,
+    run_dir: str | Path | None = None,
+    report: Reporter = _silent,
+    env: Any = None,
+    policy: Any = None,
+) -> dict[str, Any]:
+    """Train from the start; returns the summary that is also written to the run folder."""
+    for risk in settings.risks():
+        report("line", {"text": f"warning: {risk}"})
+    agent = AGENTS[settings.algorithm](settings.env if env is None else env, policy=policy, settings=settings)
+    settings = agent.settings
+    name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
+    run = Run.create(run_dir, settings_to_json(settings), name, tensorboard=settings.tensorboard)
+    return _continue(agent, run, settings.total_steps, report, best=float("-inf"), wall=0.0)
+
+
+def resume(
+    run_dir: str | Path,
+    *,
+    total_steps: int | None = None,
+    report: Reporter = _silent,
+    env: Any = None,
+    policy: Any = None,
+) -> dict[str, Any]:
+    """Go on from the newest checkpoint: weights, optimiser, normalisers, random generators, schedules.
+
+    ``total_steps`` extends a finished run. Episodes that were running at the checkpoint begin anew.
+    """
+    run = Run.open(run_dir)
+    tensors, state = checkpoint.load(run.newest_checkpoint())
+    settings = settings_from_json(state["settings"])
+    if env is None and (state["own_environment"] or ":" in settings.env):
+        raise ValueError(
+            f"{run_dir} was trained on {settings.env!r}, which no file may import. Name your code again: "
+            f"tightrope resume {run_dir} --env-module FILE.py."
+        )
+    if total_steps is not None:
+        settings = settings.with_values(total_steps=total_steps)
+    agent = AGENTS[settings.algorithm](settings.env if env is None else env, policy=policy, settings=settings)
+    restore(agent, tensors, state)
+    run.rewind(agent.steps)
+    if agent.steps + settings.num_envs > settings.total_steps:
+        report("line", {"text": f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there."})
+    return _continue(agent, run, settings.total_steps, report, best=state["best"], wall=state["wall_seconds"])
+
+
+def _continue(
+    agent: Agent, run: Run, total_steps: int, report: Reporter, *, best: float, wall: float
+) -> dict[str, Any]:
+    """The loop: update -> record -> evaluate -> save, until the budget is spent."""
+    settings = agent.settings
+    evaluator = _Evaluator(agent, run, report, best)
+    lines = [agent.engine_line, f"environments: {agent.environments.num_envs} x {settings.env}, {agent.environments.backend}"]
+    report("start", {"settings": settings_to_json(settings), "run_dir": str(run.path), "lines": lines})
+    evaluate_at = _grid(settings.evaluate_every, total_steps, agent.steps)
+    save_at = _grid(settings.checkpoint_every, total_steps, agent.steps)
+    updates = agent.iterate(total_steps, start=0)
+    begin_steps, first_wall = agent.steps, wall
+    try:
+        clock = time.perf_counter()
+        for progress in updates:
+            wall += time.perf_counter() - clock
+            metrics = dict(progress.metrics)
+            run.record_episodes(
+                {"step": agent.steps, "return": r, "length": n, "terminated": t} for r, n, t in progress.episodes
+            )
+            if evaluate_at and agent.steps >= evaluate_at[0]:
+                evaluate_at = [step for step in evaluate_at if step > agent.steps]
+                metrics |= evaluator.evaluate(wall)
+            run.record(agent.steps, wall, metrics)
+            report("update", {"step": agent.steps, "total_steps": total_steps, "metrics": metrics, "seconds": wall})
+            if save_at and agent.steps >= save_at[0]:
+                save_at = [step for step in save_at if step > agent.steps]
+                _save(agent, run, evaluator.best, wall)
+            clock = time.perf_counter()
+        final = evaluator.evaluate(wall) if settings.evaluate_every is not None else {}
+        _save(agent, run, evaluator.best, wall)
+    except KeyboardInterrupt:
+        _save(agent, run, evaluator.best, wall)
+        raise
+    finally:
+        evaluator.close()
+        agent.close()
+        run.close()
+    summary = {
+        "env": settings.env,
+        "algorithm": settings.algorithm,
+        "seed": settings.seed,
+        "steps": agent.steps,
+        "wall_seconds": wall,
+        "steps_per_second": (agent.steps - begin_steps) / max(wall - first_wall, 1e-9),
+        "final": final,
+        "best_mean_reward": evaluator.best if evaluator.best > float("-inf") else None,
+        "engine": settings.engine,
+        "run_dir": str(run.path),
+    }
+    run.finish(summary)
+    report("finish", summary)
+    return summary
+
+
+class _Evaluator:
+    """Periodic evaluation, outside the clock; keeps the best policy. Off when the environment cannot be copied."""
+
+    def __init__(self, agent: Agent, run: Run, report: Reporter, best: float) -> None:
+        self.agent, self.run, self.report, self.best = agent, run, report, best
+        self.environments = None
+        if agent.settings.evaluate_every is None:
+            return
+        try:
+            episodes = agent.settings.evaluation_episodes
+            self.environments = evaluation_environments(agent.env, agent.settings, episodes)
+        except ValueError as error:
+            report("line", {"text": f"no evaluation while training: {error}"})
+
+    def evaluate(self, wall: float) -> dict[str, float]:
+        if self.environments is None:
+            return {}
+        result = evaluate_agent(self.agent, self.environments, self.agent.settings.evaluation_episodes)
+        metrics = {
+            "eval/mean_reward": result["mean_return"],
+            "eval/std_reward": result["std_return"],
+            "eval/mean_length": result["mean_length"],
+            "eval/episodes": float(result["episodes"]),
+        }
+        self.report("evaluation", {"step": self.agent.steps, **metrics})
+        if result["mean_return"] > self.best:
+            self.best = result["mean_return"]
+            save_agent(self.agent, self.run.best)
+        return metrics
+
+    def close(self) -> None:
+        if self.environments is not None:
+            self.environments.close()
+
+
+def _grid(fraction: float | None, total_steps: int, past: int) -> list[int]:
+    """Steps at which something is due: multiples of the fraction of the run, those still ahead, the end left out."""
+    if fraction is None:
+        return []
+    points = [round(total_steps * fraction * k) for k in range(1, int(1.0 / fraction) + 1)]
+    return [point for point in points if past < point < total_steps]
+
+
+def _save(agent: Agent, run: Run, best: float, wall: float) -> None:
+    save_agent(agent, run.checkpoint_folder(agent.steps), extra={"best": best, "wall_seconds": wall})

@@ -1,0 +1,113 @@
+"""Returns and advantages: what a step was worth.
+
+Everything is per step, [B, T] in and [B, T] out: B rows (environments or prompts), T steps (or tokens) in
+time order.
+
+Two flags tell how a step ended, and they are not the same:
+
+- `terminated`: no future exists, the value after the step is 0.
+- `ended`: the segment stops here, because it terminated, was truncated by a time limit, or is cut for any
+  other reason. Every terminated step has also ended.
+
+`mask` is True where a step counts. Whatever lies in a masked step or behind a cut (NaN included) changes
+nothing, neither a value nor a gradient: cuts are `torch.where`, because 0 * NaN is NaN.
+
+Rewards, values and advantages share one unit. Source of GAE: Schulman et al. 2016,
+https://arxiv.org/abs/1506.02438
+"""
+
+import torch
+from torch import Tensor
+
+from .shapes import require_same_shape
+
+
+def td_errors(
+    rewards: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    terminated: Tensor,
+    gamma: float,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Temporal-difference errors, [B, T].
+
+    delta_t = r_t + gamma * V(s_{t+1}) - V(s_t), without the term of V(s_{t+1}) where `terminated`; 0 where
+    masked. `next_values` is V of the true next observation, also at a truncation and at the end of the
+    rollout. ValueError when the shapes differ.
+    """
+    require_same_shape(
+        rewards=rewards, values=values, next_values=next_values, terminated=terminated, mask=mask
+    )
+    future = torch.where(terminated, 0.0, next_values)
+    deltas = rewards + gamma * future - values
+    return deltas if mask is None else torch.where(mask, deltas, 0.0)
+
+
+def gae(
+    rewards: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    terminated: Tensor,
+    ended: Tensor,
+    gamma: float,
+    gae_lambda: float,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Generalised advantage estimates, [B, T].
+
+    A_t = delta_t + gamma * lambda * A_{t+1}, without the second term (the trace) where `ended`, in the last
+    column and before a masked step; 0 where masked. lambda 0 is the TD error (biased), lambda 1 is the Monte
+    Carlo return minus the value (of high variance). The target of the critic is advantages + values.
+    ValueError when the shapes differ.
+    """
+    require_same_shape(rewards=rewards, ended=ended)
+    deltas = td_errors(rewards, values, next_values, terminated, gamma, mask)
+    advantages = []
+    trace = torch.zeros_like(deltas[:, 0])
+    for t in reversed(range(deltas.shape[1])):
+        trace = deltas[:, t] + gamma * gae_lambda * torch.where(ended[:, t], 0.0, trace)
+        if mask is not None:
+            trace = torch.where(mask[:, t], trace, 0.0)
+        advantages.append(trace)
+    return torch.stack(advantages[::-1], dim=1)
+
+
+def discounted_returns(
+    rewards: Tensor,
+    ended: Tensor,
+    gamma: float,
+    bootstrap: Tensor | None = None,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Discounted sums of the rewards to come, [B, T].
+
+    G_t = r_t + gamma * G_{t+1}; where `ended` and in the last column G_t = r_t + gamma * bootstrap_t; 0 where
+    masked, and a masked step hands nothing back. `bootstrap` [B, T] is the value of the state after the step
+    and is read at those cuts alone: give 0 where the step terminated, V(s_{t+1}) where it was truncated or
+    cut. None means 0 everywhere. ValueError when the shapes differ.
+    """
+    require_same_shape(rewards=rewards, ended=ended, bootstrap=bootstrap, mask=mask)
+    tail = torch.zeros_like(rewards) if bootstrap is None else bootstrap
+    returns = []
+    future = tail[:, -1]
+    for t in reversed(range(rewards.shape[1])):
+        future = rewards[:, t] + gamma * torch.where(ended[:, t], tail[:, t], future)
+        if mask is not None:
+            future = torch.where(mask[:, t], future, 0.0)
+        returns.append(future)
+    return torch.stack(returns[::-1], dim=1)
+
+
+def next_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values: Tensor) -> Tensor:
+    """V of the true next observation of every step, [B, T].
+
+    V(s_{t+1}) is values_{t+1}, and `last_values` [B] after the last column; where `ended` the next column
+    belongs to another episode, and `final_values` [B, T] (V of the last observation of the episode) stands
+    there instead. What `final_values` holds elsewhere is not read; where the step terminated any number will
+    do, `td_errors` drops it. ValueError when the shapes differ.
+    """
+    require_same_shape(values=values, ended=ended, final_values=final_values)
+    require_same_shape(values_of_a_column=values[:, 0], last_values=last_values)
+    shifted = torch.cat([values[:, 1:], last_values[:, None]], dim=1)
+    return torch.where(ended, final_values, shifted)

@@ -1,0 +1,125 @@
+"""What entropies and divergences must fulfil: functions of (maths, case), see properties.py."""
+
+from functools import partial
+from types import ModuleType
+
+import torch
+from maths_cases import Case, close, same, with_gradients
+from torch import Tensor
+from torch.distributions import Bernoulli, Categorical, Normal, kl_divergence
+
+IMPOSSIBLE = -torch.inf
+
+
+def parameters(c: Case, count: int, width: int = 5) -> list[Tensor]:
+    """`count` random arrays [B, T, width]."""
+    generator = c.generator
+    shape = (*c.rewards.shape, width)
+    return [torch.randn(shape, generator=generator, dtype=torch.float64) for _ in range(count)]
+
+
+def the_estimators_are_the_kl_on_average(maths: ModuleType, c: Case) -> None:
+    """Summed over every action the old policy may take: E_old[k1] = E_old[k3] = KL(old || new)."""
+    old, new = (logits.log_softmax(-1) for logits in parameters(c, 2))
+    exact = (old.exp() * (old - new)).sum(-1)
+    for estimator in (maths.divergence.k1, maths.divergence.k3):
+        close((old.exp() * estimator(new - old)).sum(-1), exact)
+
+
+def the_gradient_of_k3_is_that_of_the_kl(maths: ModuleType, c: Case) -> None:
+    """Through the KL-penalised surrogate with advantages 0, as it is trained."""
+    old, new = parameters(c, 2)
+    probabilities = old.softmax(-1)
+
+    def penalty(logits: Tensor) -> Tensor:
+        log_ratio = logits.log_softmax(-1) - old.log_softmax(-1)
+        nothing = torch.zeros_like(log_ratio)
+        loss = maths.surrogate.kl_penalised_surrogate(log_ratio, nothing, 1.0)
+        return (probabilities * loss).sum(-1)
+
+    def exact(logits: Tensor) -> Tensor:
+        return kl_divergence(Categorical(logits=old), Categorical(logits=logits))
+
+    for estimated, true in zip(with_gradients(penalty, new), with_gradients(exact, new), strict=True):
+        close(estimated, true)
+
+
+def k2_and_k3_are_never_negative(maths: ModuleType, c: Case) -> None:
+    assert (maths.divergence.k2(c.log_ratio) >= 0).all()
+    assert (maths.divergence.k3(c.log_ratio) >= 0).all()
+    close(maths.divergence.k2(c.log_ratio), c.log_ratio * c.log_ratio / 2)
+    tiny = 1e-4 * c.log_ratio  # all three agree to the second order around r = 1
+    close(maths.divergence.k3(tiny), maths.divergence.k2(tiny), rtol=1e-3)
+
+
+def entropies_agree_with_torch(maths: ModuleType, c: Case) -> None:
+    logits, log_std = parameters(c, 2)
+    close(maths.divergence.categorical_entropy(logits), Categorical(logits=logits).entropy())
+    bits = Bernoulli(logits=logits, validate_args=False)
+    close(maths.divergence.bernoulli_entropy(logits), bits.entropy().sum(-1))
+    gaussian = Normal(torch.zeros_like(log_std), log_std.exp())
+    close(maths.divergence.gaussian_entropy(log_std), gaussian.entropy().sum(-1))
+
+
+def divergences_agree_with_torch(maths: ModuleType, c: Case) -> None:
+    p, q, log_std_p, log_std_q = parameters(c, 4)
+    exact = maths.divergence
+    close(exact.categorical_kl(p, q), kl_divergence(Categorical(logits=p), Categorical(logits=q)))
+    bits = kl_divergence(Bernoulli(logits=p), Bernoulli(logits=q)).sum(-1)
+    close(exact.bernoulli_kl(p, q), bits)
+    gaussians = kl_divergence(Normal(p, log_std_p.exp()), Normal(q, log_std_q.exp())).sum(-1)
+    close(exact.gaussian_kl(p, log_std_p, q, log_std_q), gaussians)
+    alone = log_std_p[0, 0]  # a standard deviation [d] that all steps share
+    close(
+        exact.gaussian_kl(p, alone, q, log_std_q),
+        exact.gaussian_kl(p, alone.expand_as(p), q, log_std_q),
+    )
+
+
+def nothing_diverges_from_itself(maths: ModuleType, c: Case) -> None:
+    p, log_std = parameters(c, 2)
+    masked = torch.where(p > 1, IMPOSSIBLE, p)
+    nothing = torch.zeros(p.shape[:-1], dtype=p.dtype)
+    close(maths.divergence.categorical_kl(p, p), nothing)
+    close(maths.divergence.bernoulli_kl(masked, masked), nothing)
+    close(maths.divergence.gaussian_kl(p, log_std, p, log_std), nothing)
+
+
+def masked_choices_do_not_exist(maths: ModuleType, c: Case) -> None:
+    """A logit of -inf gives what leaving the choice out gives, and its own gradient is 0."""
+    p, q = parameters(c, 2)
+    free = torch.tensor([True, False, True, True, False])
+    hidden_p, hidden_q = (torch.where(free, logits, IMPOSSIBLE) for logits in (p, q))
+    exact = maths.divergence
+    for function, full, short in (
+        (exact.categorical_entropy, [hidden_p], [p[..., free]]),
+        (exact.bernoulli_entropy, [hidden_p], [p[..., free]]),
+        (exact.categorical_kl, [hidden_p, hidden_q], [p[..., free], q[..., free]]),
+        (exact.bernoulli_kl, [hidden_p, hidden_q], [p[..., free], q[..., free]]),
+    ):
+        value, *gradients = with_gradients(function, *full)
+        expected, *expected_gradients = with_gradients(function, *short)
+        close(value, expected)
+        for gradient, wanted in zip(gradients, expected_gradients, strict=True):
+            close(gradient[..., free], wanted)
+            same(gradient[..., ~free], torch.zeros_like(gradient[..., ~free]))
+
+
+def a_bit_is_a_choice_of_two(maths: ModuleType, c: Case) -> None:
+    p, q = parameters(c, 2, width=1)
+    pair = partial(torch.nn.functional.pad, pad=(0, 1))  # the logits (l, 0)
+    exact = maths.divergence
+    close(exact.bernoulli_entropy(p), exact.categorical_entropy(pair(p)))
+    close(exact.bernoulli_kl(p, q), exact.categorical_kl(pair(p), pair(q)))
+
+
+PROPERTIES = (
+    the_estimators_are_the_kl_on_average,
+    the_gradient_of_k3_is_that_of_the_kl,
+    k2_and_k3_are_never_negative,
+    entropies_agree_with_torch,
+    divergences_agree_with_torch,
+    nothing_diverges_from_itself,
+    masked_choices_do_not_exist,
+    a_bit_is_a_choice_of_two,
+)

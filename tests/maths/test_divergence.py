@@ -1,0 +1,99 @@
+"""Entropies and divergences: numbers worked by hand, extremes and derivatives."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tightrope.maths.divergence import (
+    bernoulli_entropy,
+    bernoulli_kl,
+    categorical_entropy,
+    categorical_kl,
+    gaussian_entropy,
+    gaussian_kl,
+    k1,
+    k2,
+    k3,
+)
+
+
+def logits(*probabilities: float) -> Tensor:
+    return torch.tensor(probabilities, dtype=torch.float64).log() + 3  # any constant may be added
+
+
+def test_estimators_by_hand() -> None:
+    x = torch.tensor([[math.log(2)]], dtype=torch.float64)
+    assert k1(x).item() == pytest.approx(-math.log(2))
+    assert k2(x).item() == pytest.approx(math.log(2) ** 2 / 2)
+    assert k3(x).item() == pytest.approx(2 - 1 - math.log(2))
+
+
+def test_the_average_of_the_estimators_by_hand() -> None:
+    # old (1/2, 1/2), new (1/4, 3/4): log ratios log 1/2 and log 3/2,
+    # KL = 0.5 log 2 + 0.5 log 2/3 = 0.5 log 4/3
+    x = torch.tensor([[0.5, 1.5]], dtype=torch.float64).log()
+    assert k1(x).mean().item() == pytest.approx(0.5 * math.log(4 / 3))
+    assert k3(x).mean().item() == pytest.approx(0.5 * math.log(4 / 3))
+    assert categorical_kl(logits(0.5, 0.5), logits(0.25, 0.75)).item() == pytest.approx(0.5 * math.log(4 / 3))
+
+
+def test_k3_keeps_its_digits_near_ratio_1() -> None:
+    """k3 of x is x^2 / 2 to first order; exp(x) - 1 - x in float32 would be mostly rounding error."""
+    x = torch.tensor([[1e-3]])
+    assert k3(x).item() == pytest.approx(5e-7, rel=1e-3)
+
+
+def test_entropies_by_hand() -> None:
+    # 0.5 log 2 + 2 * 0.25 log 4 = 1.5 log 2
+    assert categorical_entropy(logits(0.5, 0.25, 0.25)).item() == pytest.approx(1.5 * math.log(2))
+    assert categorical_entropy(logits(0.5, 0.5, 0)).item() == pytest.approx(math.log(2))
+    assert categorical_entropy(logits(0, 1, 0)).item() == 0
+    # two fair bits, and a third that is masked
+    assert bernoulli_entropy(torch.tensor([0.0, 0.0, -torch.inf])).item() == pytest.approx(2 * math.log(2))
+    assert gaussian_entropy(torch.zeros(2)).item() == pytest.approx(math.log(2 * math.pi * math.e))
+
+
+def test_gaussian_kl_by_hand() -> None:
+    # log(2 / 1) + (1 + 3^2) / (2 * 4) - 1/2 = log 2 + 0.75
+    zero, three, log_2 = torch.zeros(1), torch.tensor([3.0]), torch.tensor([math.log(2)])
+    assert gaussian_kl(three, zero, zero, log_2).item() == pytest.approx(math.log(2) + 0.75)
+
+
+def test_extreme_logits_are_certain_choices() -> None:
+    certain = torch.tensor([[1000.0, -1000.0]], requires_grad=True)
+    for entropy in (categorical_entropy(certain), bernoulli_entropy(certain)):
+        assert entropy.item() == 0
+        (gradient,) = torch.autograd.grad(entropy.sum(), certain)
+        assert gradient.tolist() == [[0, 0]]
+    other = torch.zeros(1, 2)
+    assert categorical_kl(certain, other).item() == pytest.approx(math.log(2))
+    assert bernoulli_kl(certain, other).item() == pytest.approx(2 * math.log(2))
+
+
+def test_a_choice_that_q_cannot_make_is_infinitely_far() -> None:
+    masked = torch.tensor([0.0, -torch.inf])
+    assert categorical_kl(torch.zeros(2), masked).item() == math.inf
+    assert bernoulli_kl(torch.zeros(2), masked).item() == math.inf
+    assert categorical_kl(masked, torch.zeros(2)).item() == pytest.approx(math.log(2))
+
+
+@pytest.mark.parametrize(
+    ("function", "inputs"),
+    [
+        (k1, 1),
+        (k2, 1),
+        (k3, 1),
+        (categorical_entropy, 1),
+        (bernoulli_entropy, 1),
+        (gaussian_entropy, 1),
+        (categorical_kl, 2),
+        (bernoulli_kl, 2),
+        (gaussian_kl, 4),
+    ],
+)
+def test_gradients_agree_with_finite_differences(function, inputs: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    drawn = [torch.randn(2, 3, 4, generator=generator, dtype=torch.float64) for _ in range(inputs)]
+    assert torch.autograd.gradcheck(function, [x.requires_grad_() for x in drawn])

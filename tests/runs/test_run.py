@@ -1,0 +1,177 @@
+"""A run folder holds what it promises, in JSON that every reader accepts, and is never overwritten."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tightrope.runs import checkpoint
+from tightrope.runs.records import dumps, plain, read_json, read_lines, write_json
+from tightrope.runs.run import Run
+
+SETTINGS = {"env": "CartPole-v1", "hidden": (64, 64), "clip": 0.2}
+
+
+def strict(text: str) -> object:
+    def refuse(literal: str) -> None:
+        raise AssertionError(f"{literal} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_settings_are_there_before_the_first_step(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", SETTINGS, "name")
+    assert json.loads((run.path / "settings.json").read_text()) == {**SETTINGS, "hidden": [64, 64]}
+    assert Run.open(run.path).settings == run.settings
+
+
+def test_default_folders_differ_and_are_safe_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = {Run.create(None, {}, "module:ALE/Pong-v5-ppo-1").path for _ in range(3)}
+    assert len(paths) == 3
+    for path in paths:
+        assert path.parent == Path("runs")
+        assert path.name.startswith("module-ALE-Pong-v5-ppo-1-2")
+
+
+def test_a_folder_with_something_in_it_is_never_used(tmp_path: Path) -> None:
+    (tmp_path / "note.txt").write_text("mine")
+    for path in (tmp_path, tmp_path / "note.txt"):
+        with pytest.raises(ValueError, match=r"not empty.*--run-dir"):
+            Run.create(path, SETTINGS, "name")
+    assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_metrics_and_episodes_are_readable_at_once(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", SETTINGS, "name")
+    run.record(2048, 1.5, {"train/approx_kl": np.float32(0.25), "rollout/ep_rew_mean": float("nan")})
+    run.record_episodes([{"step": 9, "return": 1.0, "length": 3}, {"step": 12, "return": 2.0, "length": 4}])
+    run.record_episodes([])
+    text = (run.path / "metrics.jsonl").read_text()
+    wanted = {"step": 2048, "seconds": 1.5, "train/approx_kl": 0.25, "rollout/ep_rew_mean": None}
+    assert strict(text) == wanted
+    assert Run.open(run.path).read_metrics() == [wanted]
+    assert [row["return"] for row in run.read_episodes()] == [1.0, 2.0]
+    run.close()
+    run.record(4096, 3.0, {})
+    assert [row["step"] for row in run.read_metrics()] == [2048, 4096]
+    run.close()
+
+
+def test_an_undeclared_metric_is_refused_and_not_written(tmp_path: Path) -> None:
+    with Run.create(tmp_path / "a", SETTINGS, "name") as run:
+        with pytest.raises(ValueError, match="Did you mean 'time/fps'"):
+            run.record(1, 1.0, {"time/fsp": 3.0})
+        assert run.read_metrics() == []
+
+
+def test_rewind_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
+    with Run.create(tmp_path / "a", SETTINGS, "name") as run:
+        for step in (10, 20, 30):
+            run.record(step, step / 10, {"time/fps": 1.0})
+            run.record_episodes([{"step": step - 1, "return": 0.0, "length": 1}])
+        checkpoint.save(run.checkpoint_folder(20), {}, {})
+        (run.checkpoints / f"{checkpoint.TEMPORARY}step").mkdir()
+        with open(run.path / "metrics.jsonl", "a") as file:
+            file.write('{"step": 40, "sec')  # a crash in the middle of a line
+        run.rewind(20)
+        run.record(25, 2.5, {})
+        assert [row["step"] for row in run.read_metrics()] == [10, 20, 25]
+        assert [row["step"] for row in run.read_episodes()] == [9, 19]
+        assert run.newest_checkpoint() == run.checkpoint_folder(20)
+        assert [p.name for p in run.checkpoints.iterdir()] == ["step-000000000020"]
+
+
+def test_the_summary_ends_a_run(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", SETTINGS, "name")
+    run.finish({"steps": np.int64(5), "eval": {"mean": torch.tensor(1.5), "std": float("inf")}})
+    assert strict((run.path / "summary.json").read_text()) == {"steps": 5, "eval": {"mean": 1.5, "std": None}}
+    assert not [p for p in run.path.iterdir() if p.name.startswith(".")]
+
+
+def test_what_is_no_run_is_named_with_a_near_one(tmp_path: Path) -> None:
+    Run.create(tmp_path / "CartPole-1", SETTINGS, "name")
+    with pytest.raises(ValueError, match=r"no such folder.*Did you mean .*CartPole-1\?"):
+        Run.open(tmp_path / "CartPole-2")
+    with pytest.raises(ValueError, match=r"no settings.json.*newest run is .*CartPole-1"):
+        Run.open(tmp_path)
+    (tmp_path / "CartPole-1" / "settings.json").write_text("[1]")
+    with pytest.raises(ValueError, match="expected an object"):
+        Run.open(tmp_path / "CartPole-1")
+    (tmp_path / "CartPole-1" / "settings.json").write_text('{"clip": NaN}')
+    with pytest.raises(ValueError, match="not readable as JSON"):
+        Run.open(tmp_path / "CartPole-1")
+
+
+def test_tensorboard_files_hold_the_scalars(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    with Run.create(tmp_path / "a", SETTINGS, "name", tensorboard=True) as run:
+        run.record(100, 1.0, {"train/entropy": -0.5, "train/approx_kl": float("nan")})
+        events = EventAccumulator(str(run.path / "tensorboard"))
+        events.Reload()
+    assert events.Tags()["scalars"] == ["train/entropy"]
+    assert [(e.step, e.value) for e in events.Scalars("train/entropy")] == [(100, -0.5)]
+
+
+def test_tensorboard_without_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(ValueError, match=r"pip install 'tightrope\[tensorboard\]'"):
+        Run.create(tmp_path / "a", SETTINGS, "name", tensorboard=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(JSON)
+def test_plain_values_return_as_they_are_on_one_line(value: object) -> None:
+    text = dumps(value)
+    assert strict(text) == value
+    assert "\n" not in text
+
+
+def test_no_literal_that_json_lacks() -> None:
+    values = [
+        float("nan"),
+        float("inf"),
+        -np.inf,
+        np.float32("nan"),
+        np.array([1.0, np.nan]),
+        torch.tensor([np.inf]),
+    ]
+    assert plain(values) == [None, None, None, None, [1.0, None], [None]]
+    assert strict(dumps({"a": values})) == {"a": plain(values)}
+    assert plain({1: Path("a/b"), "b": np.bool_(True), "c": np.int8(3)}) == {"1": "a/b", "b": True, "c": 3}
+
+
+def test_a_json_file_is_whole_or_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "x.json"
+    write_json(path, {"a": 1})
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("crash")))
+        with pytest.raises(OSError, match="crash"):
+            write_json(path, {"a": 2})
+    assert read_json(path) == {"a": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_torn_line_is_left_out_at_the_end_only(tmp_path: Path) -> None:
+    path = tmp_path / "x.jsonl"
+    path.write_text('{"a": 1}\n{"a": 2}\n{"a"')
+    assert read_lines(path) == [{"a": 1}, {"a": 2}]
+    path.write_text('{"a": 1}\n{"a"\n{"a": 3}\n')
+    with pytest.raises(ValueError, match="line 2"):
+        read_lines(path)

@@ -1,0 +1,568 @@
+"""The command line: every setting is a documented flag, every mistake an answer and exit code 2, stdout is
+clean.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tightrope import cli, flags, options, panel
+from tightrope.algorithms.settings import range_text
+from tightrope.control.settings import (
+    ALGORITHM_SETTINGS,
+    TrainSettings,
+    settings_from_json,
+    settings_to_json,
+    values_from_json,
+)
+
+ALGORITHMS = list(ALGORITHM_SETTINGS)
+
+
+def run_main(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    code = cli.main(list(words))
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def resolved(*words: str) -> tuple[str, dict[str, Any]]:
+    return options.overrides(*options.train_options(list(words)))
+
+
+# ------------------------------------------------------------------------------------------------ the flags
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_setting_is_a_flag_with_doc_range_and_default(algorithm: str) -> None:
+    parser = options.train_parser(algorithm)
+    text = " ".join(parser.format_help().split())
+    known = parser.flags()
+    for kind in (TrainSettings, ALGORITHM_SETTINGS[algorithm]):
+        for field in dataclasses.fields(kind):
+            if field.name in ("env", "update"):
+                continue
+            assert field.name.replace("_", "-") in known
+            assert field.metadata["doc"].endswith(".")
+            help_text = flags.help_text(field, optional=field.default is None)
+            assert "default" in help_text
+            assert range_text(field.metadata) in help_text
+            assert " ".join(field.metadata["doc"].split()[:3]) in text
+
+
+@pytest.mark.parametrize(
+    "make", [*ALGORITHMS, options.evaluate_parser, options.record_parser, options.resume_parser]
+)
+def test_every_option_has_help_and_fits_100_columns(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    parser = options.train_parser(make) if isinstance(make, str) else make()
+    assert all(action.help for action in parser._actions)
+    assert max(map(len, parser.format_help().splitlines())) <= 100
+
+
+def test_every_setting_stands_in_a_named_group() -> None:
+    assert "more" not in options.train_parser().format_help().split("\n\n")
+    listed = [name for names in options.GROUPS.values() for name in names]
+    assert sorted(listed) == sorted(flags.settings_fields(TrainSettings))
+
+
+def as_words(kind: type, value: dict[str, Any]) -> list[str]:
+    words = []
+    for name in flags.settings_fields(kind):
+        flag, x = name.replace("_", "-"), value[name]
+        if isinstance(x, bool):
+            words.append(f"--{flag}" if x else f"--no-{flag}")
+        elif isinstance(x, list):
+            words += [f"--{flag}", *map(str, x)]
+        else:
+            words.append(f"--{flag}={'none' if x is None else x}")
+    return words
+
+
+CHANGED = {
+    "ppo": {"clip": 0.1, "target_kl": 0.015, "recompute_advantages": True, "clip_schedule": "linear"},
+    "a2c": {"gae_lambda": 0.9, "max_grad_norm": None, "normalise_advantages": False},
+    "reinforce": {"baseline": False, "entropy_weight": 0.02},
+}
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("changed", [False, True])
+def test_flags_say_every_setting_and_return_it(algorithm: str, changed: bool) -> None:
+    values = (
+        {"hidden": (32,), "shared": True, "log_std_init": -0.5, "seed": 7} | CHANGED[algorithm]
+        if changed
+        else {}
+    )
+    settings = TrainSettings().with_values(algorithm=algorithm, **values)
+    data = settings_to_json(settings)
+    words = as_words(TrainSettings, data) + as_words(ALGORITHM_SETTINGS[algorithm], data["update"])
+    env, said = resolved("Task-v0", *words)
+    assert env == "Task-v0"
+    assert dataclasses.replace(TrainSettings().with_values(**said), env=settings.env) == settings
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_settings_file_runs_again_and_flags_win(tmp_path: Path, algorithm: str) -> None:
+    settings = TrainSettings(env="Task-v0").with_values(
+        algorithm=algorithm, gamma=0.9, hidden=(8, 8), num_workers=3
+    )
+    (tmp_path / "settings.json").write_text(json.dumps(settings_to_json(settings)))
+    for path in (tmp_path, tmp_path / "settings.json"):
+        env, values = resolved("--settings", str(path))
+        assert TrainSettings(env=env).with_values(**values) == settings
+    env, values = resolved("Other-v0", "--settings", str(tmp_path), "--gamma", "0.8", "--num-workers", "none")
+    expected = settings.with_values(env="Other-v0", gamma=0.8, num_workers=None)
+    assert TrainSettings(env=env).with_values(**values) == expected
+
+
+def test_another_update_rule_leaves_the_files_own_settings(tmp_path: Path) -> None:
+    data = settings_to_json(TrainSettings().with_values(clip=0.1, gamma=0.9, num_envs=4))
+    (tmp_path / "settings.json").write_text(json.dumps(data))
+    _, values = resolved("--settings", str(tmp_path), "--algorithm", "a2c")
+    assert values["algorithm"] == "a2c"
+    assert values["num_envs"] == 4
+    assert not {"clip", "gamma"} & set(values)
+
+
+def test_only_what_is_given_overrides_the_preset() -> None:
+    assert resolved("Task-v0", "--num_envs", "4", "--total-steps=1e6") == (
+        "Task-v0",
+        {"num_envs": 4, "total_steps": 1_000_000},
+    )
+    assert resolved("Task-v0", "--total-steps", "100_000", "--hidden")[1] == {
+        "total_steps": 100_000,
+        "hidden": (),
+    }
+
+
+def test_dry_run_prints_the_settings_and_stops(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    os.chdir(tmp_path)
+    code, out, _ = run_main(capsys, "train", "CartPole-v1", "--dry-run", "--clip", "0.1", "--seed", "5")
+    settings = settings_from_json(json.loads(out))
+    assert (code, settings.env, settings.seed) == (0, "CartPole-v1", 5)
+    assert settings_to_json(settings)["update"]["clip"] == 0.1
+    assert list(tmp_path.iterdir()) == []
+
+
+# ------------------------------------------------------------------------------------------- settings as JSON
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ([], "list"),
+        ({"algorithm": "sac"}, "sac"),
+        ({"update": 3}, "update is 3"),
+        ({"num_env": 3}, "Did you mean 'num_envs'"),
+        ({"update": {"clipp": 3}}, "Did you mean 'clip'"),
+        ({"algorithm": "a2c", "update": {"clip": 0.2}}, "A2CSettings has no setting named 'clip'"),
+        ({"num_envs": "8"}, "num_envs is '8'; expected int"),
+        ({"num_envs": 8.0}, "expected int"),
+        ({"num_envs": True}, "expected int"),
+        ({"num_envs": None}, "expected int"),
+        ({"shared": 1}, "expected bool"),
+        ({"hidden": [64, "64"]}, "whole numbers"),
+        ({"hidden": 64}, "whole numbers"),
+        ({"update": {"gamma": "0.9"}}, "expected float"),
+        ({"update": {"target_kl": False}}, "expected float or null"),
+        ({"update": {"gamma": 1.5}}, "gamma is 1.5"),
+    ],
+)
+def test_a_settings_file_is_checked(data: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        settings_from_json(data)
+
+
+def test_numbers_without_a_point_are_floats_where_floats_are_due() -> None:
+    values = values_from_json({"update": {"gamma": 1}})
+    assert type(values["gamma"]) is float
+
+
+# ------------------------------------------------------------------------------------------------ mistakes
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("n_steps", "num-steps"),
+        ("n-envs", "num-envs"),
+        ("n_epochs", "num-epochs"),
+        ("update_epochs", "num-epochs"),
+        ("num_ppo_epochs", "num-epochs"),
+        ("noptepochs", "num-epochs"),
+        ("batch_size", "minibatch-size"),
+        ("num-minibatches", "minibatch-size"),
+        ("clip_range", "clip"),
+        ("clip_coef", "clip"),
+        ("cliprange", "clip"),
+        ("clip_range_vf", "value-clip"),
+        ("cliprange_value", "value-clip"),
+        ("ent_coef", "entropy-weight"),
+        ("vf-coef", "value-weight"),
+        ("lam", "gae-lambda"),
+        ("lambda", "gae-lambda"),
+        ("lr", "learning-rate"),
+        ("total_timesteps", "total-steps"),
+        ("timesteps", "total-steps"),
+        ("kl_coef", "kl-beta"),
+        ("init_kl_coef", "kl-beta"),
+        ("norm_adv", "normalise-advantages"),
+        ("anneal_lr", "learning-rate-schedule"),
+        ("no-norm-adv", "no-normalise-advantages"),
+        ("use_sde", "std gsde"),
+        ("net_arch", "hidden"),
+        ("activation_fn", "activation"),
+        ("normalize-observations", "normalise-observations"),
+        ("normalize_advantages", "normalise-advantages"),
+        ("normalize_advantage", "normalise-advantages"),
+        ("whiten_rewards", "normalise-rewards"),
+        ("learnin-rate", "learning-rate"),
+        ("num_env", "num-envs"),
+        ("totl-steps", "total-steps"),
+    ],
+)
+def test_a_wrong_flag_is_answered_with_the_right_one(
+    capsys: pytest.CaptureFixture[str], given: str, meant: str
+) -> None:
+    for words in ([f"--{given}", "1"], [f"--{given}=1"]):
+        code, out, err = run_main(capsys, "train", "CartPole-v1", *words)
+        assert (code, out) == (2, "")
+        assert f"Did you mean --{meant}?" in err
+        assert "Traceback" not in err
+
+
+def test_every_peer_name_leads_to_a_real_flag() -> None:
+    known = {flag for algorithm in ALGORITHMS for flag in options.train_parser(algorithm).flags()}
+    for name, meant in flags.PEER_NAMES.items():
+        assert meant.replace("_", "-").split()[0] in known
+        assert name.replace("_", "-") not in known
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["trian"], ["no command 'trian'", "tightrope train"]),
+        (["train"], ["Which task?"]),
+        (["train", "CartPole-v1", "--clip", "x"], ["--clip", "'x'", "a number"]),
+        (["train", "CartPole-v1", "--num-envs", "2.5"], ["--num-envs", "'2.5'", "whole number"]),
+        (["train", "CartPole-v1", "--num-envs", "none"], ["--num-envs", "'none'"]),
+        (["train", "CartPole-v1", "--clip", "-1"], ["clip is -1.0", "0 < x"]),
+        (["train", "CartPole-v1", "--gamma", "nan"], ["gamma is nan"]),
+        (["train", "CartPole-v1", "--activation", "tahn"], ["'tahn'", "Did you mean tanh?"]),
+        (["train", "CartPole-v1", "--algorithm", "pppo"], ["'pppo'", "Did you mean ppo?"]),
+        (["train", "--hidden", "8", "CartPole-v1"], ["'CartPole-v1'", "before"]),
+        (["train", "CartPole-v1", "--settings", "nowhere.json"], ["nowhere.json", "no such file"]),
+        (["train", "CartPole-v1", "--env-module", "nowhere.py"], ["nowhere.py", "no such file"]),
+        (["train", "CartPole-v1", "--env-module", "no_such_module"], ["no_such_module", "no such module"]),
+        (["train", "CartPole-v1", "--algorithm", "a2c", "--clip", "0.2"], ["of ppo, not of a2c", "--gamma"]),
+        (
+            ["train", "CartPole-v1", "--algorithm=a2c", "--n_epochs", "2"],
+            ["--num-epochs", "of ppo, not of a2c"],
+        ),
+        (["train", "CartPole-v1", "--no-baseline"], ["--baseline", "of reinforce, not of ppo"]),
+        (["evaluate"], ["RUN"]),
+        (["evaluate", "run", "--episode", "3"], ["Did you mean --episodes?"]),
+        (["evaluate", "run", "--episodes", "0"], ["at least 1"]),
+        (["resume", "run", "--total-timesteps", "3"], ["Did you mean --total-steps?"]),
+        (["record", "run", "--seed", "-3"], ["at least 0"]),
+    ],
+)
+def test_a_mistake_is_exit_code_2_and_a_message(
+    capsys: pytest.CaptureFixture[str], words: list[str], parts: list[str]
+) -> None:
+    code, out, err = run_main(capsys, *words)
+    assert (code, out) == (2, "")
+    for part in parts:
+        assert part in err
+    assert "Traceback" not in err
+
+
+def test_a_folder_that_is_not_empty_is_not_used(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from tightrope.runs.run import Run
+
+    (tmp_path / "mine.txt").write_text("mine")
+    fake_training(lambda settings, run_dir, report: Run.create(run_dir, {}, "name"))
+    code, _, err = run_main(capsys, "train", "CartPole-v1", "--run-dir", str(tmp_path))
+    assert code == 2
+    assert "not empty" in err
+
+
+def test_an_error_inside_other_code_keeps_its_traceback() -> None:
+    fake_training(lambda settings, run_dir, report: int("this is a bug, not a user's mistake"))
+    with pytest.raises(ValueError, match="a bug"):
+        cli.main(["train", "CartPole-v1"])
+
+
+def test_a_file_never_names_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    data = settings_to_json(TrainSettings(env="evil_module:Task-v0"))
+    (tmp_path / "settings.json").write_text(json.dumps(data))
+    code, _, err = run_main(capsys, "train", "--settings", str(tmp_path))
+    assert code == 2
+    assert "evil_module:Task-v0" in err
+    assert "evil_module" not in sys.modules
+    assert resolved("evil_module:Task-v0", "--settings", str(tmp_path))[0] == "evil_module:Task-v0"
+
+
+def test_the_users_module_is_imported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "my_helper_for_tasks.py").write_text("STARTED = []\n")
+    (tmp_path / "my_tasks.py").write_text(
+        "import my_helper_for_tasks\nmy_helper_for_tasks.STARTED.append(1)\n"
+    )
+    code, _, _ = run_main(
+        capsys, "train", "CartPole-v1", "--dry-run", "--env-module", str(tmp_path / "my_tasks.py")
+    )
+    assert code == 0
+    assert sys.modules["my_helper_for_tasks"].STARTED == [1]
+
+
+# ------------------------------------------------------------------------------------------------ what is printed
+
+
+SETTINGS = {"env": "CartPole-v1", "algorithm": "ppo", "seed": 1, "total_steps": 1000}
+SUMMARY = {
+    "steps": 1000,
+    "wall_seconds": 2.0,
+    "best": float("inf"),
+    "final": {"eval/mean_reward": 480.0, "eval/std_reward": 5.0, "eval/episodes": 10.0},
+}
+
+
+@pytest.fixture(autouse=True)
+def clean_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """Undo what a command may change: working folder, sys.path, modules."""
+    path, folder = list(sys.path), os.getcwd()
+    before = {
+        name: sys.modules.get(name) for name in ("tightrope.control.train", "tightrope.control.evaluate")
+    }
+    yield
+    sys.path[:] = path
+    os.chdir(folder)
+    for name, module in before.items():
+        sys.modules.pop(name, None)
+        if module is not None:
+            sys.modules[name] = module
+    for name in ("my_tasks", "my_helper_for_tasks"):
+        sys.modules.pop(name, None)
+
+
+def fake_training(train: Any) -> None:
+    module = types.ModuleType("tightrope.control.train")
+    module.train = train  # type: ignore[attr-defined]
+    sys.modules["tightrope.control.train"] = module
+
+
+def a_run(folder: Path, stop_at: int | None = None) -> Any:
+    """A training function that reports 100 updates as the real one does, without learning anything."""
+    from tightrope.runs.run import Run
+
+    def train(settings: TrainSettings, run_dir: str | None, report: Any) -> dict[str, Any]:
+        with Run.create(folder / "run", settings_to_json(settings), "name") as run:
+            report("line", {"text": "warning: clip is high"})
+            report("start", {"settings": SETTINGS, "run_dir": str(run.path), "lines": ["engine: fused"]})
+            for update in range(1, 101):
+                values = {"rollout/ep_rew_mean": float(update), "train/approx_kl": 0.01, "time/fps": 5000.0}
+                values |= {"rollout/ep_len_mean": 20.0, "train/clip_fraction": 0.1}
+                run.record(10 * update, update / 50, values)
+                data = {"step": 10 * update, "total_steps": 1000, "metrics": values, "seconds": update / 50}
+                report("update", data)
+                if update % 20 == 0:
+                    report(
+                        "evaluation", {"step": 10 * update, "eval/mean_reward": 3.0, "eval/std_reward": 1.0}
+                    )
+                if update == stop_at:
+                    raise KeyboardInterrupt
+            run.finish(SUMMARY)
+        report("finish", SUMMARY)
+        return SUMMARY
+
+    return train
+
+
+def test_json_is_the_last_line_and_nothing_else(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    fake_training(a_run(tmp_path))
+    code, out, err = run_main(capsys, "train", "CartPole-v1", "--json")
+    assert code == 0
+    assert "NaN" not in out
+    assert "Infinity" not in out
+    result = json.loads(out)
+    assert result["run_dir"] == str(tmp_path / "run")
+    assert result["best"] is None
+    assert result["final"]["eval/mean_reward"] == 480.0
+    assert "warning: clip is high" in err
+    assert "engine: fused" in err
+
+
+def test_plain_lines_are_about_twenty_and_aligned(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    fake_training(a_run(tmp_path))
+    code, out, err = run_main(capsys, "train", "CartPole-v1")
+    lines = out.splitlines()
+    head = next(i for i, line in enumerate(lines) if "steps/s" in line)
+    table = lines[head : head + 21]
+    assert code == 0
+    assert len({len(line) for line in table}) == 1
+    assert [line.split()[0] for line in table[1:]] == [f"{50 * k:,}" for k in range(1, 21)]
+    assert "\x1b" not in out
+    assert "warning: clip is high" in err
+    run = tmp_path / "run"
+    assert "mean return 480.0 ± 5.00 over 10 episodes" in out
+    assert f"next         tightrope evaluate {run}" in out
+    assert f"tightrope record {run}" in out
+    assert "1,000 steps in 0:02 (500 steps/s)" in out
+
+
+def test_quiet_prints_the_end_only(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    fake_training(a_run(tmp_path))
+    code, out, err = run_main(capsys, "train", "CartPole-v1", "--quiet")
+    assert code == 0
+    assert [line.split()[0] for line in out.splitlines()] == ["evaluation", "training", "run"]
+    assert err == "warning: clip is high\n"
+    fake_training(a_run(tmp_path / "b"))
+    _, out, err = run_main(capsys, "train", "CartPole-v1", "--quiet", "--json")
+    assert len(out.splitlines()) == 1
+    assert err == "warning: clip is high\n"
+
+
+def test_ctrl_c_says_how_to_go_on(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    module = tmp_path / "my_tasks.py"
+    module.write_text("")
+    folder = tmp_path / "with space"
+    fake_training(a_run(folder, stop_at=7))
+    code, _, err = run_main(capsys, "train", "CartPole-v1", "--env-module", str(module))
+    assert code == 130
+    assert f"tightrope resume '{folder / 'run'}' --env-module {module}" in err
+    assert "step 70" in err
+    assert "Traceback" not in err
+
+
+def test_ctrl_c_before_the_run(capsys: pytest.CaptureFixture[str]) -> None:
+    def stop(settings: Any, run_dir: Any, report: Any) -> None:
+        raise KeyboardInterrupt
+
+    fake_training(stop)
+    code, _, err = run_main(capsys, "train", "CartPole-v1")
+    assert (code, err) == (130, "Stopped before the run began.\n")
+
+
+def test_evaluate_passes_what_is_given_and_prints_the_interval(capsys: pytest.CaptureFixture[str]) -> None:
+    seen: dict[str, Any] = {}
+
+    def evaluate_run(path: str, **values: Any) -> dict[str, Any]:
+        seen.update(values, path=path)
+        return {"mean_return": 100.0, "std_return": 10.0, "ci95": 2.0, "episodes": 96}
+
+    module = types.ModuleType("tightrope.control.evaluate")
+    module.evaluate_run = evaluate_run  # type: ignore[attr-defined]
+    sys.modules["tightrope.control.evaluate"] = module
+    code, out, _ = run_main(capsys, "evaluate", "runs/a", "--episodes", "96", "--best")
+    assert (code, seen) == (0, {"path": "runs/a", "episodes": 96, "best": True})
+    assert "mean return 100.00" in out
+    assert "98.00 to 102.00" in out
+    code, out, _ = run_main(capsys, "evaluate", "runs/a", "--json")
+    assert json.loads(out.splitlines()[-1])["mean_return"] == 100.0
+
+
+# ------------------------------------------------------------------------------------------------ speed, process
+
+
+@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["evaluate", "--help"]])
+def test_help_is_quick_and_needs_no_heavy_package(words: list[str]) -> None:
+    heavy = "torch numba gymnasium numpy rich safetensors"
+    code = (
+        "import sys\nfrom tightrope.cli import main\ntry:\n    code = main(sys.argv[1:])\n"
+        "except SystemExit as end:\n    code = end.code\n"
+        f"print('heavy:', [m for m in '{heavy}'.split() if m in sys.modules])\nsys.exit(code)"
+    )
+    begin = time.perf_counter()
+    result = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    seconds = time.perf_counter() - begin
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.splitlines()[-1] == "heavy: []"
+    assert seconds < 1.5  # 0.1 s on a quiet machine; the promise is 0.5
+
+
+def test_python_dash_m_is_the_same() -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "tightrope", "train", "X", "--lr", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stdout) == (2, "")
+    assert "--learning-rate" in result.stderr
+
+
+# ------------------------------------------------------------------------------------------------ panel and curves
+
+
+def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) -> None:
+    import io
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    stream = Terminal()
+    report = panel.choose(stream, quiet=False, live=True)
+    begin = time.monotonic()
+    with report:
+        a_run(tmp_path)(TrainSettings(), None, report)
+    paints = stream.getvalue().count("CartPole-v1")
+    assert 2 <= paints <= 4 + 4 * (time.monotonic() - begin)
+    last = stream.getvalue().rpartition("CartPole-v1")[2]
+    for part in (
+        "1,000 of 1,000 steps",
+        "100.0",
+        "KL 0.0100",
+        "clipped 10.0 %",
+        "5,000 steps/s",
+        "3.00 ± 1.00",
+        "█",
+    ):
+        assert part in last
+    assert "engine: fused" in stream.getvalue()
+
+
+@pytest.mark.parametrize("environment", [{"NO_COLOR": "1"}, {"TERM": "dumb"}, {"CI": "true"}])
+def test_no_panel_where_it_is_not_wanted(environment: dict[str, str]) -> None:
+    terminal = types.SimpleNamespace(isatty=lambda: True)
+    assert panel.can_live(terminal, {"TERM": "xterm"})  # type: ignore[arg-type]
+    assert not panel.can_live(terminal, environment)  # type: ignore[arg-type]
+    assert not panel.can_live(types.SimpleNamespace(isatty=lambda: False), {})  # type: ignore[arg-type]
+
+
+def test_curves_rise_with_their_values() -> None:
+    assert panel.sparkline([1, 2, 3, 4, 5, 6, 7, 8], 8) == panel.BARS
+    assert panel.sparkline([5.0, 5.0], 8) == "▁▁"
+    assert panel.sparkline([], 8) == ""
+    assert len(panel.sparkline(list(range(1000)), 30)) == 30
+    lines = panel.curve([(10 * k, float(k)) for k in range(200)], width=40, height=4)
+    assert len(lines) == 5
+    filled = [sum(not c.isspace() for c in line.partition("│")[2]) for line in lines[:4]]
+    assert filled == sorted(filled)
+    assert filled[-1] >= 39
+    assert lines[-1].split() == ["0", "1,990", "steps"]
+    assert panel.curve([(1, 1.0)]) == []
+    assert len(panel.curve([(1, 5.0), (2, 5.0)])) == 9
+    assert panel.curve([(1, float("nan")), (2, 1.0)]) == []
+
+
+def test_figures_are_short() -> None:
+    assert [panel.number(x) for x in (1234.56, 12.25, 0.01234, 0.0, None, float("nan"))] == [
+        "1,234.6",
+        "12.25",
+        "0.0123",
+        "0.00",
+        "-",
+        "-",
+    ]
+    assert [panel.clock(x) for x in (7, 67.4, 3725, float("nan"))] == ["0:07", "1:07", "1:02:05", "-"]
