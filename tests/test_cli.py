@@ -39,7 +39,7 @@ def resolved(*words: str) -> tuple[str, dict[str, Any]]:
     return options.overrides(*options.train_options(list(words)))
 
 
-# ------------------------------------------------------------------------------------------------ the flags
+# ---------------------------------------------------------------------------- the flags
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -154,7 +154,7 @@ def test_dry_run_prints_the_settings_and_stops(capsys: pytest.CaptureFixture[str
     assert list(tmp_path.iterdir()) == []
 
 
-# ------------------------------------------------------------------------------------------- settings as JSON
+# ---------------------------------------------------------------------------- settings as JSON
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_numbers_without_a_point_are_floats_where_floats_are_due() -> None:
     assert type(values["gamma"]) is float
 
 
-# ------------------------------------------------------------------------------------------------ mistakes
+# ---------------------------------------------------------------------------- mistakes
 
 
 @pytest.mark.parametrize(
@@ -325,7 +325,7 @@ def test_the_users_module_is_imported(tmp_path: Path, capsys: pytest.CaptureFixt
     assert sys.modules["my_helper_for_tasks"].STARTED == [1]
 
 
-# ------------------------------------------------------------------------------------------------ what is printed
+# ---------------------------------------------------------------------------- what is printed
 
 
 SETTINGS = {"env": "CartPole-v1", "algorithm": "ppo", "seed": 1, "total_steps": 1000}
@@ -407,10 +407,10 @@ def test_plain_lines_are_about_twenty_and_aligned(capsys: pytest.CaptureFixture[
     code, out, err = run_main(capsys, "train", "CartPole-v1")
     lines = out.splitlines()
     head = next(i for i, line in enumerate(lines) if "steps/s" in line)
-    table = lines[head : head + 21]
+    table = lines[head : head + 22]
     assert code == 0
     assert len({len(line) for line in table}) == 1
-    assert [line.split()[0] for line in table[1:]] == [f"{50 * k:,}" for k in range(1, 21)]
+    assert [line.split()[0] for line in table[1:]] == ["10", *(f"{50 * k:,}" for k in range(1, 21))]
     assert "\x1b" not in out
     assert "warning: clip is high" in err
     run = tmp_path / "run"
@@ -471,7 +471,7 @@ def test_evaluate_passes_what_is_given_and_prints_the_interval(capsys: pytest.Ca
     assert json.loads(out.splitlines()[-1])["mean_return"] == 100.0
 
 
-# ------------------------------------------------------------------------------------------------ speed, process
+# ---------------------------------------------------------------------------- speed, process
 
 
 @pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["evaluate", "--help"]])
@@ -501,7 +501,7 @@ def test_python_dash_m_is_the_same() -> None:
     assert "--learning-rate" in result.stderr
 
 
-# ------------------------------------------------------------------------------------------------ panel and curves
+# ---------------------------------------------------------------------------- panel and curves
 
 
 def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) -> None:
@@ -566,3 +566,27 @@ def test_figures_are_short() -> None:
         "-",
     ]
     assert [panel.clock(x) for x in (7, 67.4, 3725, float("nan"))] == ["0:07", "1:07", "1:02:05", "-"]
+
+
+def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
+    import io
+
+    class Gone(io.StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    report = panel.choose(Gone(), quiet=False, live=False)
+    with report:
+        summary = a_run(tmp_path)(TrainSettings(), None, report)
+    assert summary == SUMMARY
+    assert report.step == 1000
+
+
+def test_time_left_counts_this_runs_steps_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    progress = panel.Progress()
+    progress.take("start", {"settings": SETTINGS, "run_dir": "run", "step": 400})
+    now[0] += 10.0
+    progress.take("update", {"step": 600, "total_steps": 1000, "metrics": {}, "seconds": 1.0})
+    assert progress.seconds_left() == pytest.approx(20.0)

@@ -1,7 +1,7 @@
 """tightrope: PPO from CartPole to RLHF on one verified core.
 
-    agent = tightrope.PPO("CartPole-v1", seed=1).learn(100_000)
-    action, _ = agent.predict(observation)
+agent = tightrope.PPO("CartPole-v1", seed=1).learn(100_000)
+action, _ = agent.predict(observation)
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from tightrope.options import (
     train_options,
 )
 
-# ------------------------------------------------------------------------------------------------ commands
+# ---------------------------------------------------------------------------- commands
 
 
 def train(words: list[str]) -> int:
@@ -84,7 +84,7 @@ def record(words: list[str]) -> int:
     """``tightrope record RUN``: an mp4 of the saved policy."""
     given = record_parser().read(words)
     _import_named(given.get("env_module"))
-    from tightrope.control.evaluate import record_run
+    from tightrope.control.record import record_run
 
     names = ("out", "best", "episodes", "seed", "env")
     result = record_run(given["run"], **{name: given[name] for name in names if name in given})
@@ -132,7 +132,7 @@ def _import_named(name: str | None) -> None:
     spec.loader.exec_module(module)
 
 
-# -------------------------------------------------------------------------------------------------- output
+# ---------------------------------------------------------------------------- output
 
 
 def _watched(run: Callable[[Any], dict[str, Any]], given: Options) -> int:
@@ -286,5 +286,10 @@ def main(words: list[str] | None = None) -> int:
             raise
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return 2
+    except (
+        BrokenPipeError
+    ):  # whoever read our output is gone; Python must not try to flush to it on its way out
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except KeyboardInterrupt:
         return 130

@@ -244,7 +244,7 @@ def reader(kind: type, optional: bool, choices: tuple[str, ...] | None) -> Calla
 
 
 def width(word: str) -> int:
-    """One entry of a list of whole numbers; a task's id that was swallowed by the list is told where to go."""
+    """One entry of a list of whole numbers; a task swallowed by the list is told where to go."""
     try:
         return whole(word)
     except ValueError:

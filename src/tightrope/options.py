@@ -191,7 +191,10 @@ def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
         if meant is None and suggestion(name, known) is None:
             meant = suggestion(name, flags)
         if meant is not None and meant not in known:
-            return f"--{meant} is a setting of {other}, not of {algorithm}. Settings of {algorithm}: {own}"
+            seen = "" if meant == name.removeprefix("no-") else f"There is no flag --{name}; "
+            return (
+                f"{seen}--{meant} is a setting of {other}, not of {algorithm}. Settings of {algorithm}: {own}"
+            )
     return unknown_flag(name, known)
 
 

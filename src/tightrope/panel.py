@@ -56,7 +56,7 @@ class Lines:
         self.step = 0
         self._stream, self._rows, self._next = stream, rows, 0.0
         self._progress = Progress()
-        self._head = False
+        self._head = self._owed = False
 
     def __call__(self, event: str, data: dict[str, Any]) -> None:
         """Print what is due."""
@@ -68,26 +68,30 @@ class Lines:
             elif self._rows:
                 self._print(str(data["text"]))
         elif self._rows and event == "start":
-            for line in data.get("lines", ()):
-                self._print(str(line))
+            self._print("\n".join(str(line) for line in data.get("lines", ())))
         elif self._rows and event == "update":
-            self._update()
+            self._owed = True
+            share = self._progress.total_steps / self._rows
+            if self.step >= self._next:
+                self._next = (math.floor(self.step / share) + 1) * share
+                self._row()
+        elif event == "finish" and self._owed:
+            self._row()
 
-    def _update(self) -> None:
-        progress = self._progress
-        if progress.step < self._next and progress.step < progress.total_steps:
-            return
-        share = progress.total_steps / self._rows
-        self._next = (math.floor(progress.step / share) + 1) * share
+    def _row(self) -> None:
+        self._owed = False
+        cells = zip(self._progress.row(), _COLUMNS, strict=True)
+        text = "".join(f"{cell:>{width}}" for cell, (_, width) in cells)
         if not self._head:
-            self._print("".join(f"{name:>{width}}" for name, width in _COLUMNS))
+            text = "".join(f"{name:>{width}}" for name, width in _COLUMNS) + "\n" + text
             self._head = True
-        self._print(
-            "".join(f"{cell:>{width}}" for cell, (_, width) in zip(progress.row(), _COLUMNS, strict=True))
-        )
+        self._print(text)
 
     def _print(self, text: str) -> None:
-        print(text, file=self._stream, flush=True)
+        try:
+            print(text, file=self._stream, flush=True)
+        except BrokenPipeError:  # `tightrope train ... | head`: the reader left, the run goes on
+            self._rows = 0
 
     def __enter__(self) -> Lines:
         return self
@@ -188,6 +192,7 @@ class Progress:
         self.step = self.total_steps = 0
         self.metrics: dict[str, Any] = {}
         self.returns: list[float] = []
+        self.length: float | None = None
         self.evaluation: tuple[float, float] | None = None
         self._start_step, self._start_time = 0, time.monotonic()
 
@@ -206,6 +211,7 @@ class Progress:
             value = self.metrics.get("rollout/ep_rew_mean", math.nan)
             if _finite(value):
                 self.returns.append(float(value))
+                self.length = self.metrics.get("rollout/ep_len_mean")
         elif event == "evaluation":
             self.evaluation = (data["eval/mean_reward"], data["eval/std_reward"])
 
@@ -224,7 +230,7 @@ class Progress:
             f"{self.step:,}",
             f"{share:.0f}",
             number(return_),
-            number(values.get("rollout/ep_len_mean")),
+            number(self.length),
             f"{values['train/approx_kl']:.4f}" if _finite(values.get("train/approx_kl")) else "-",
             f"{100 * clipped:.1f} %" if clipped is not None and _finite(clipped) else "-",
             f"{values['time/fps']:,.0f}" if _finite(values.get("time/fps")) else "-",

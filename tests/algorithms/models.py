@@ -26,7 +26,9 @@ class TinyModel(nn.Module):
         return Evaluation(chosen, -(logp.exp() * logp).sum(-1), self.critic(x)[..., 0])
 
 
-def make_batch(model: TinyModel, rows: int = 24, columns: int = 1, seed: int = 0, masked: float = 0.0) -> Batch:
+def make_batch(
+    model: TinyModel, rows: int = 24, columns: int = 1, seed: int = 0, masked: float = 0.0
+) -> Batch:
     """Random steps whose old_logp and old_values are the model's own."""
     rng = np.random.default_rng(seed)
     dtype = model.actor.weight.dtype
@@ -40,7 +42,15 @@ def make_batch(model: TinyModel, rows: int = 24, columns: int = 1, seed: int = 0
     inputs = {"flat": tensor(rng.standard_normal((*shape, 4)))}
     actions = torch.from_numpy(rng.integers(0, 3, (*shape, 1)).astype(np.float32))
     empty = torch.zeros(shape, dtype=dtype)
-    batch = Batch(inputs, actions, empty, empty, tensor(rng.standard_normal(shape)), tensor(rng.standard_normal(shape)), mask)
+    batch = Batch(
+        inputs,
+        actions,
+        empty,
+        empty,
+        tensor(rng.standard_normal(shape)),
+        tensor(rng.standard_normal(shape)),
+        mask,
+    )
     with torch.no_grad():
         now = model(batch)
     model.calls = 0

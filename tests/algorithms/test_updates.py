@@ -14,7 +14,11 @@ from tightrope.algorithms import a2c, ppo, reinforce
 from tightrope.algorithms.optimise import NonFiniteError, SamplingMismatch, make_optimiser
 from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings
 
-RULES = [(ppo, PPOSettings(num_epochs=1, minibatch_size=1000)), (a2c, A2CSettings()), (reinforce, ReinforceSettings())]
+RULES = [
+    (ppo, PPOSettings(num_epochs=1, minibatch_size=1000)),
+    (a2c, A2CSettings()),
+    (reinforce, ReinforceSettings()),
+]
 
 
 def run(rule, settings, *, batch=None, model=None, seed=0, **more):
@@ -46,7 +50,9 @@ def test_all_rules_have_one_signature():
 
 
 def test_the_diff_of_a2c_and_ppo_is_epochs_minibatches_clip_and_kl_stop():
-    """Every line of code that a2c has and ppo has not is the plain policy gradient, or the batch in one piece."""
+    """Every line of code that a2c has and ppo has not is the plain policy gradient, or the batch in one
+    piece.
+    """
     code = [inspect.getsource(rule.update).split('"""')[2].splitlines() for rule in (a2c, ppo)]
     stripped = [[line.strip() for line in lines if line.strip()] for lines in code]
     only_a2c = [line[2:] for line in difflib.ndiff(*stripped) if line.startswith("- ")]
@@ -92,7 +98,9 @@ def test_every_row_is_used_once_an_epoch_and_the_last_minibatch_may_be_smaller()
 
 
 def test_metrics_are_means_over_all_minibatches():
-    """With a learning rate too small to move anything, the mean over minibatches is the mean over the batch."""
+    """With a learning rate too small to move anything, the mean over minibatches is the mean over the
+    batch.
+    """
     settings = PPOSettings(num_epochs=2, minibatch_size=7, learning_rate=1e-12, normalise_advantages=False)
     model = TinyModel()
     batch = make_batch(model)
@@ -128,7 +136,9 @@ def test_kl_stop_is_decided_before_the_step_and_ends_all_epochs():
 
 def test_a_nan_gradient_takes_no_step_and_says_so():
     batch = make_batch(TinyModel())
-    batch = dataclasses.replace(batch, advantages=batch.advantages.index_fill(0, torch.tensor([3]), torch.nan))
+    batch = dataclasses.replace(
+        batch, advantages=batch.advantages.index_fill(0, torch.tensor([3]), torch.nan)
+    )
     for rule, settings in RULES:
         model = TinyModel()
         settings = dataclasses.replace(settings, normalise_advantages=False)
@@ -151,8 +161,12 @@ def test_separate_learning_rates_move_actor_and_critic_separately():
     settings = PPOSettings(num_epochs=1, minibatch_size=24, learning_rate=1e-2, critic_learning_rate=1e-3)
     model, _ = run(ppo, settings)
     start = TinyModel()
-    assert float((model.actor.weight - start.actor.weight).detach().abs().max()) == pytest.approx(1e-2, rel=0.02)
-    assert float((model.critic.weight - start.critic.weight).detach().abs().max()) == pytest.approx(1e-3, rel=0.02)
+    assert float((model.actor.weight - start.actor.weight).detach().abs().max()) == pytest.approx(
+        1e-2, rel=0.02
+    )
+    assert float((model.critic.weight - start.critic.weight).detach().abs().max()) == pytest.approx(
+        1e-3, rel=0.02
+    )
 
 
 def test_one_joint_norm_limits_all_gradients():
@@ -164,7 +178,9 @@ def test_one_joint_norm_limits_all_gradients():
     limit = free["train/grad_norm"] / 4
     other = TinyModel()
     optimiser = torch.optim.SGD(other.parameters(), lr=1.0)
-    ppo.update(other, optimiser, batch, dataclasses.replace(settings, max_grad_norm=limit), np.random.default_rng(0))
+    ppo.update(
+        other, optimiser, batch, dataclasses.replace(settings, max_grad_norm=limit), np.random.default_rng(0)
+    )
     start = weights(TinyModel())
     torch.testing.assert_close(weights(other) - start, (weights(model) - start) / 4, rtol=1e-4, atol=1e-6)
 
@@ -173,7 +189,9 @@ def test_extra_loss_joins_the_loss_and_its_metrics():
     def pull(model, part, evaluation):
         return 10.0 * model.actor.bias.square().sum(), {"entropy": torch.zeros(part.mask.shape)}
 
-    model, metrics = run(ppo, PPOSettings(num_epochs=20, minibatch_size=24, learning_rate=1e-2), extra_loss=pull)
+    model, metrics = run(
+        ppo, PPOSettings(num_epochs=20, minibatch_size=24, learning_rate=1e-2), extra_loss=pull
+    )
     plain, plain_metrics = run(ppo, PPOSettings(num_epochs=20, minibatch_size=24, learning_rate=1e-2))
     assert model.actor.bias.norm() < 0.5 * plain.actor.bias.norm()
     assert metrics["train/entropy"] == pytest.approx(plain_metrics["train/entropy"] / 2, rel=0.2)

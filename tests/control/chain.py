@@ -1,7 +1,7 @@
 """A tiny deterministic task for tests of the environment side: the observation says (row, episode, step).
 
-Episode k of row r follows ``SCRIPT[(k + r) % len(SCRIPT)]``: its length and how it ends. Nothing is random; the row
-is taken from the seed, so that every way to vectorise the task must deliver the same transitions.
+Episode k of row r follows ``SCRIPT[(k + r) % len(SCRIPT)]``: its length and how it ends. Nothing is random;
+the row is taken from the seed, so that every way to vectorise the task must deliver the same transitions.
 """
 
 from __future__ import annotations
@@ -12,7 +12,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-SCRIPT = ((3, "terminated"), (2, "truncated"), (1, "terminated"), (4, "truncated"), (1, "truncated"), (3, "both"))
+SCRIPT = (
+    (3, "terminated"),
+    (2, "truncated"),
+    (1, "terminated"),
+    (4, "truncated"),
+    (1, "truncated"),
+    (3, "both"),
+)
 BASE_SEED = 100
 OBSERVATIONS = gym.spaces.Box(-1e6, 1e6, (3,), np.float32)
 ACTIONS = gym.spaces.Discrete(3, start=5)
@@ -24,7 +31,9 @@ def reward_of(row: int, episode: int, step: int, action: int) -> float:
 
 
 class Chain(gym.Env):
-    """One copy. ``mask`` is how it forbids action (episode + step) % 3: "none", "info", "method" or "observation"."""
+    """One copy. ``mask`` is how it forbids action (episode + step) % 3: "none", "info", "method" or
+    "observation".
+    """
 
     observation_space: gym.Space = OBSERVATIONS
     action_space = ACTIONS
@@ -74,7 +83,8 @@ class Chain(gym.Env):
 class ChainVector(gym.vector.VectorEnv):
     """All copies in one object, as a task's own vector version: any mode, float32 rewards, arrays used again.
 
-    SAME_STEP gives a dense ``final_obs`` without a mask, as Atari's does. ``faulty_mask``: reset ignores the mask.
+    SAME_STEP gives a dense ``final_obs`` without a mask, as Atari's does. ``faulty_mask``: reset ignores the
+    mask.
     """
 
     def __init__(
@@ -105,7 +115,9 @@ class ChainVector(gym.vector.VectorEnv):
         self.ended[mask] = False
         return self.observations, {}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         rewards = np.zeros(self.num_envs, np.float32)
         terminated, truncated = np.zeros((2, self.num_envs), bool)
         infos: dict[str, Any] = {}
@@ -128,7 +140,9 @@ class ChainVector(gym.vector.VectorEnv):
 
 
 def register() -> None:
-    """Put the task into the registry, once: with and without a vector version, and with a wrapper-made time limit."""
+    """Put the task into the registry, once: with and without a vector version, and with a wrapper-made
+    time limit.
+    """
     if "tightrope_tests/Chain-v0" in gym.registry:
         return
     gym.register("tightrope_tests/Chain-v0", entry_point=Chain)
@@ -153,13 +167,19 @@ def action_for(flat: np.ndarray) -> np.ndarray:
 
 
 def transitions(environments: Any, count: int, seed: int = BASE_SEED) -> list[list[tuple[Any, ...]]]:
-    """The first ``count`` transitions of each row, in order: observation, action, reward, flags, true next one."""
+    """The first ``count`` transitions of each row, in order: observation, action, reward, flags, true
+    next one.
+    """
     inputs, _ = environments.reset(seed)
     rows: list[list[tuple[Any, ...]]] = [[] for _ in range(environments.num_envs)]
     while min(len(row) for row in rows) < count:
         actions = action_for(inputs["flat"])
         step = environments.step(actions)
-        finals = {} if step.final_rows is None else dict(zip(step.final_rows, step.final_inputs["flat"], strict=True))
+        finals = (
+            {}
+            if step.final_rows is None
+            else dict(zip(step.final_rows, step.final_inputs["flat"], strict=True))
+        )
         for i, row in enumerate(rows):
             if step.phantom is not None and step.phantom[i]:
                 assert step.rewards[i] == 0 and not step.terminated[i] and not step.truncated[i]

@@ -76,13 +76,17 @@ class ConditionProbe(ValueByObservation):
 
 
 class Forever(Probe):
-    """Reward 1 for ever; the time limit around it truncates. V = 1 / (1 - gamma) when truncations bootstrap."""
+    """Reward 1 for ever; the time limit around it truncates. V = 1 / (1 - gamma) when truncations
+    bootstrap.
+    """
 
     length = 10**9
 
 
 class Identity(gym.Env):
-    """Pays for answering with the observation, in any action space that can be compared with an observation."""
+    """Pays for answering with the observation, in any action space that can be compared with an
+    observation.
+    """
 
     def __init__(self, space, length=16):
         self.observation_space = self.action_space = space

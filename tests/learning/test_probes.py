@@ -105,7 +105,9 @@ SPACES = {
 @pytest.mark.parametrize("name", SPACES)
 def test_identity_in_every_space(name):
     """Answer with what is seen: at least 85 % of the pay after 24,000 steps."""
-    agent = tightrope.PPO(lambda: Identity(SPACES[name]), seed=2, gamma=0.5, **{**FAST, **PLAIN}, log_std_init=-0.5)
+    agent = tightrope.PPO(
+        lambda: Identity(SPACES[name]), seed=2, gamma=0.5, **{**FAST, **PLAIN}, log_std_init=-0.5
+    )
     agent.learn(24_000)
     env = Identity(SPACES[name], length=300)
     observation, _ = env.reset(seed=11)
@@ -118,7 +120,9 @@ def test_identity_in_every_space(name):
     assert total / 300 >= 0.85
 
 
-@pytest.mark.parametrize("changes", [{"squash": True}, {"std": "state"}, {"std": "gsde"}, {"std": "gsde", "squash": True}], ids=str)
+@pytest.mark.parametrize(
+    "changes", [{"squash": True}, {"std": "state"}, {"std": "gsde"}, {"std": "gsde", "squash": True}], ids=str
+)
 def test_identity_with_every_kind_of_gaussian(changes):
     values = {**FAST, **PLAIN, "hidden": (32, 32), "log_std_init": -0.5, "gamma": 0.5, **changes}
     agent = tightrope.PPO(lambda: Identity(SPACES["box"]), seed=2, **values).learn(32_000)
@@ -133,7 +137,9 @@ def test_identity_with_every_kind_of_gaussian(changes):
 
 
 class MaskedBandit(gym.Env):
-    """Five arms; a changing set is forbidden, and pulling a forbidden arm is an error. The best allowed arm pays 1."""
+    """Five arms; a changing set is forbidden, and pulling a forbidden arm is an error. The best allowed arm
+    pays 1.
+    """
 
     observation_space = spaces.Box(0.0, 1.0, (5,), np.float32)
     action_space = spaces.Discrete(5)

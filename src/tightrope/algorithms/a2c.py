@@ -1,6 +1,6 @@
 """Synchronous advantage actor-critic: one step on the whole rollout along the plain policy gradient.
 
-    L = E[ -A log pi(a|s) ] + value_weight * L_value - entropy_weight * H                     (Mnih et al. 2016)
+    L = E[ -A log pi(a|s) ] + value_weight * L_value - entropy_weight * H   (Mnih et al. 2016)
 
 Read beside ppo.py: epochs, minibatches, the clip and the KL stop are what it leaves out.
 """
@@ -36,8 +36,8 @@ def update(
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout by one step; returns the metrics.
 
-    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced, metrics)``.
-    ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
+    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced,
+    metrics)``. ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the log-ratios exceed
     ``log_ratio_limit``.
     """

@@ -30,7 +30,8 @@ class Batch:
     """Steps to learn from. Everything per step is [B, T]; ``mask`` is True where a step counts.
 
     ``inputs`` is opaque: a dict of tensors whose leading axis is the row (control: [B, T, ...] observations).
-    ``actions`` is [B, T, ...]; ``old_logp`` is the sampler's own log-probability; ``returns`` = advantages + old values.
+    ``actions`` is [B, T, ...]; ``old_logp`` is the sampler's own log-probability; ``returns`` = advantages +
+    old values.
     """
 
     inputs: dict[str, Tensor]
@@ -82,7 +83,9 @@ class Batch:
             yield self.select(order[start : start + size])
 
     def split(self, size: int | None) -> Iterator[Batch]:
-        """Consecutive parts of at most ``size`` rows (None: the batch whole); their gradients add up to the whole's."""
+        """Consecutive parts of at most ``size`` rows (None: the batch whole); their gradients add up to the
+        whole's.
+        """
         if size is None or size >= len(self):
             yield self
             return

@@ -1,4 +1,6 @@
-"""What all update rules do alike: build Adam, take a checked step, and keep the books over every minibatch."""
+"""What all update rules do alike: build Adam, take a checked step, and keep the books over every
+minibatch.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def set_learning_rates(optimiser: torch.optim.Optimizer, settings: UpdateSetting
 
 
 class Meter:
-    """Sums over every minibatch of an update, divided once at the end; nothing is read from the device before."""
+    """Sums over every minibatch of an update, divided once at the end; nothing is read from the device
+    before.
+    """
 
     def __init__(self) -> None:
         self._sums: dict[str, Tensor] = {}
@@ -91,8 +95,9 @@ def book_ratios(meter: Meter, log_ratio: Tensor, mask: Tensor, clip: float, clip
 class Brake:
     """Decides on the device, before a step, whether it may be taken; once on, it stays on.
 
-    ``kl``: the minibatch's KL is above target_kl.  ``bad``: the gradient norm is not finite.  A fused Adam skips
-    the step by itself (its ``found_inf``), so an accelerator need not be waited for; the host looks when it polls.
+    ``kl``: the minibatch's KL is above target_kl.  ``bad``: the gradient norm is not finite.  A fused Adam
+    skips the step by itself (its ``found_inf``), so an accelerator need not be waited for; the host looks
+    when it polls.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -119,13 +124,15 @@ class Brake:
         meter.add_sum("grad_norm", norm.detach(), 1.0)
 
     def halted(self, *, poll: bool = False) -> bool:
-        """Whether to stop; raises NonFiniteError for a bad gradient. Waits for an accelerator only when polled."""
+        """Whether to stop; raises NonFiniteError for a bad gradient. Waits for an accelerator only when
+        polled.
+        """
         if self._lazy and not poll:
             return False
         if bool(self.bad):
             raise NonFiniteError(
-                "The gradient holds a NaN or an infinity; that step was not taken and the weights are as before it. "
-                "Look for extreme rewards, observations or a learning rate that is too high."
+                "The gradient holds a NaN or an infinity; that step was not taken and the weights are as "
+                "before it. Look for extreme rewards, observations or a learning rate that is too high."
             )
         return bool(self.kl)
 
@@ -140,7 +147,8 @@ def check_first_ratios(log_ratio: Tensor, limit: float | None) -> None:
     worst = float(log_ratio.detach().abs().max())
     if not worst <= limit:
         raise SamplingMismatch(
-            f"Before any update the log-probabilities differ by {worst:.3g} from those that sampled (limit {limit:g}). "
-            "Sampling and training disagree. Likely causes: dropout or batch normalisation left on in the policy, a "
-            "normaliser that moved between rollout and update, another temperature or action mask in training."
+            f"Before any update the log-probabilities differ by {worst:.3g} from those that sampled (limit "
+            f"{limit:g}). Sampling and training disagree. Likely causes: dropout or batch normalisation left "
+            "on in the policy, a normaliser that moved between rollout and update, another temperature or "
+            "action mask in training."
         )

@@ -1,7 +1,7 @@
 """Proximal policy optimisation: several epochs of minibatches on one rollout, held near the sampling policy.
 
     L = E[ -min(r A, clip(r, 1 - clip, 1 + clip) A) ] + value_weight * L_value - entropy_weight * H
-    r = pi(a|s) / pi_old(a|s)                                                  (Schulman et al. 2017, eq. 7 and 9)
+    r = pi(a|s) / pi_old(a|s)        (Schulman et al. 2017, eq. 7, 9)
 
 Read beside a2c.py: epochs, minibatches, the clip and the KL stop are all that is added.
 """
@@ -41,7 +41,9 @@ def value_loss(new: Tensor, part: Batch, settings: PPOSettings) -> Tensor:
 
 
 def next_kl_beta(kl_beta: float, kl: float, kl_adapt: float) -> float:
-    """The adaptive KL penalty of the PPO paper (eq. 8): halved below kl_adapt / 1.5, doubled above 1.5 kl_adapt."""
+    """The adaptive KL penalty of the PPO paper (eq. 8): halved below kl_adapt / 1.5, doubled above 1.5
+    kl_adapt.
+    """
     if kl < kl_adapt / 1.5:
         return kl_beta / 2
     return kl_beta * 2 if kl > kl_adapt * 1.5 else kl_beta
@@ -60,8 +62,8 @@ def update(
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout; returns the metrics, means over every minibatch.
 
-    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced, metrics)``;
-    ``refresh(batch) -> batch`` estimates advantages anew when ``recompute_advantages`` is on.
+    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced,
+    metrics)``; ``refresh(batch) -> batch`` estimates advantages anew when ``recompute_advantages`` is on.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the first log-ratios exceed
     ``log_ratio_limit``.
     """

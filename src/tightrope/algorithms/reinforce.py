@@ -1,6 +1,6 @@
 """REINFORCE: one step on the whole rollout along the policy gradient of Monte Carlo returns.
 
-    L = E[ -(G - b) log pi(a|s) ] - entropy_weight * H;  G = sum_k gamma^k r_{t+k}                   (Williams 1992)
+    L = E[ -(G - b) log pi(a|s) ] - entropy_weight * H;  G = sum_k gamma^k r_{t+k}   (Williams 1992)
 
 With a baseline, b = V(s) is learned beside it and cut episodes are continued by V; without, b = 0 and the
 steps of episodes that do not finish inside the rollout are masked. Read beside a2c.py: lambda is 1, no more.
@@ -37,8 +37,8 @@ def update(
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout by one step; returns the metrics.
 
-    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced, metrics)``.
-    ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
+    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced,
+    metrics)``. ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the log-ratios exceed
     ``log_ratio_limit``.
     """

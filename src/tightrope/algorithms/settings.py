@@ -1,6 +1,7 @@
 """The settings of the update rules: frozen data, checked where they are made, imported without torch.
 
-Each field carries its own one-line help and its range; the command line, the validation and the docs read them here.
+Each field carries its own one-line help and its range; the command line, the validation and the docs read
+them here.
 """
 
 from __future__ import annotations
@@ -63,7 +64,9 @@ def check_ranges(settings: Any) -> None:
             too_high = metadata.get("at_most") is not None and number > metadata["at_most"]
             if too_low or at_edge or too_high or not math.isfinite(number):
                 expected = range_text(metadata) or "a finite number"
-                raise ValueError(f"{field.name} is {value!r}; expected {expected}. Choose a value in that range.")
+                raise ValueError(
+                    f"{field.name} is {value!r}; expected {expected}. Choose a value in that range."
+                )
 
 
 def scheduled(value: T, schedule: Schedule, progress: float) -> T:
@@ -84,7 +87,9 @@ SCHEDULES = get_args(Schedule)
 class UpdateSettings:
     """What every update rule of the family reads."""
 
-    gamma: float = setting(0.99, "Discount per step: a reward k steps ahead counts gamma^k.", above=0, at_most=1)
+    gamma: float = setting(
+        0.99, "Discount per step: a reward k steps ahead counts gamma^k.", above=0, at_most=1
+    )
     gae_lambda: float = setting(
         0.95, "GAE's lambda: 0 = one-step TD error (bias), 1 = Monte Carlo (variance).", at_least=0, at_most=1
     )
@@ -95,18 +100,26 @@ class UpdateSettings:
     entropy_weight_schedule: Schedule = setting(
         "constant", "How entropy_weight falls over the run.", choices=SCHEDULES
     )
-    learning_rate: float = setting(3e-4, "Adam's step size (actor, and critic unless it has its own).", above=0)
-    critic_learning_rate: float | None = setting(None, "Adam's step size for the critic; none: the same.", above=0)
+    learning_rate: float = setting(
+        3e-4, "Adam's step size (actor, and critic unless it has its own).", above=0
+    )
+    critic_learning_rate: float | None = setting(
+        None, "Adam's step size for the critic; none: the same.", above=0
+    )
     learning_rate_schedule: Schedule = setting(
         "linear", "How both learning rates fall over the run.", choices=SCHEDULES
     )
-    adam_eps: float = setting(1e-5, "Adam's epsilon; 1e-5 is PPO's habit, torch's own default is 1e-8.", above=0)
+    adam_eps: float = setting(
+        1e-5, "Adam's epsilon; 1e-5 is PPO's habit, torch's own default is 1e-8.", above=0
+    )
     max_grad_norm: float | None = setting(
         0.5, "One joint limit on the norm of all gradients; none: gradients are not clipped.", above=0
     )
     normalise_advantages: bool = setting(True, "Advantages to mean 0 and deviation 1 within each minibatch.")
     micro_batch_size: int | None = setting(
-        None, "Rows per forward pass; splits a minibatch to save memory, the gradient stays the same.", at_least=1
+        None,
+        "Rows per forward pass; splits a minibatch to save memory, the gradient stays the same.",
+        at_least=1,
     )
 
     def __post_init__(self) -> None:
@@ -123,7 +136,9 @@ class UpdateSettings:
         if "learning_rate" in values:
             critic = self.critic_learning_rate  # type: ignore[attr-defined]
             values["critic_learning_rate"] = scheduled(critic, self.learning_rate_schedule, progress)  # type: ignore[attr-defined]
-        present = object.__new__(type(self))  # a rate of exactly 0 at the end is legal here, not as a user's input
+        present = object.__new__(
+            type(self)
+        )  # a rate of exactly 0 at the end is legal here, not as a user's input
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
             object.__setattr__(present, field.name, values.get(field.name, getattr(self, field.name)))
         return present
@@ -139,12 +154,16 @@ class PPOSettings(UpdateSettings):
         0.2, "The ratio new/old probability may move this far from 1 before its gradient is cut.", above=0
     )
     clip_schedule: Schedule = setting("constant", "How clip falls over the run.", choices=SCHEDULES)
-    clip_high: float | None = setting(None, "Another upper side for the clip (1 + clip_high); none: clip.", above=0)
+    clip_high: float | None = setting(
+        None, "Another upper side for the clip (1 + clip_high); none: clip.", above=0
+    )
     dual_clip: float | None = setting(
         None, "Bound the loss of bad actions at dual_clip * |advantage|; none: off, 3 is usual.", above=1
     )
     value_clip: float | None = setting(
-        None, "Also keep value updates within +- this (returns' units after reward scaling); none: off.", above=0
+        None,
+        "Also keep value updates within +- this (returns' units after reward scaling); none: off.",
+        above=0,
     )
     target_kl: float | None = setting(
         None, "Stop the whole update before a step whose minibatch KL exceeds this; 0.015 is usual.", above=0
@@ -153,9 +172,13 @@ class PPOSettings(UpdateSettings):
         None, "Use the KL-penalised surrogate with this weight in place of the clip; none: clip.", above=0
     )
     kl_adapt: float | None = setting(
-        None, "With kl_beta: the KL per update aimed at, kl_beta doubles or halves to reach it; none: fixed.", above=0
+        None,
+        "With kl_beta: the KL per update aimed at, kl_beta doubles or halves to reach it; none: fixed.",
+        above=0,
     )
-    recompute_advantages: bool = setting(False, "Estimate values and advantages anew before each later epoch.")
+    recompute_advantages: bool = setting(
+        False, "Estimate values and advantages anew before each later epoch."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -151,7 +151,7 @@ class ActionLayout:
         if part is None:
             return
         pieces = list(part) if len(components) > 1 else [part]
-        if len(components) > 1 and np.size(part) == target.size and not isinstance(part, tuple | list):
+        if len(components) > 1 and not isinstance(part, tuple | list) and np.size(part) == target.size:
             pieces = np.split(
                 np.reshape(part, target.shape), np.cumsum([c.count for c in components])[:-1], axis=1
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -44,14 +45,23 @@ class Progress:
 class Agent:
     """A policy that learns on an environment. Use PPO, A2C or Reinforce.
 
-    ``env``: a Gymnasium id, an environment, a factory or a vector environment.  ``policy``: a torch module of your
-    own (see Policy).  Everything else is a field of TrainSettings or of the algorithm's settings, by name; what is
-    not given comes from the preset of the task.
+    ``env``: a Gymnasium id, an environment, a factory or a vector environment.  ``policy``: a torch module of
+    your own (see Policy).  ``notify`` gets lines worth saying, such as a compilation.  Everything else is a
+    field of TrainSettings or of the algorithm's settings, by name; what is not given comes from the preset of
+    the task.
     """
 
     algorithm: ClassVar[str]
 
-    def __init__(self, env: Any, *, policy: Any = None, settings: TrainSettings | None = None, **values: Any) -> None:
+    def __init__(
+        self,
+        env: Any,
+        *,
+        policy: Any = None,
+        settings: TrainSettings | None = None,
+        notify: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
+        **values: Any,
+    ) -> None:
         self.settings = settings or resolve(env, self.algorithm, values)
         self.env, self._own = env, policy
         self.environments = _environments(env, self.settings)
@@ -59,15 +69,21 @@ class Agent:
         torch_device = torch.device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
         self.policy = Policy(*layouts, present, policy).to(torch_device)
-        self.optimiser = make_optimiser(self.policy.parameters(), self.policy.critic_parameters(), present.update)
+        self.optimiser = make_optimiser(
+            self.policy.parameters(), self.policy.critic_parameters(), present.update
+        )
         self.normalisers = _normalisers(self.environments, present)
         self.cores = available_cores()
-        self.engine, self.engine_line = engines.choose(self.policy, self.optimiser, present, self.cores)
+        self.engine, self.engine_line = engines.choose(
+            self.policy, self.optimiser, present, self.cores, notify
+        )
         self.sampling_rng, self.update_rng = (np.random.default_rng([present.seed, k]) for k in (1, 2))
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
         self.steps, self.kl_beta = 0, getattr(present.update, "kl_beta", None)
-        self._fresh = True
-        backend = self.environments.backend if self.environments.backend != "given" else present.vector_backend
+        self._fresh, self.engine_check = True, ""
+        backend = (
+            self.environments.backend if self.environments.backend != "given" else present.vector_backend
+        )
         self.settings = dataclasses.replace(
             present,
             num_envs=self.environments.num_envs,
@@ -80,7 +96,9 @@ class Agent:
     # ---------------------------------------------------------------------------------------------- learning
 
     def learn(self, total_steps: int | None = None) -> Agent:
-        """Train for at most ``total_steps`` more agent steps (default: the settings'); schedules run over them."""
+        """Train for at most ``total_steps`` more agent steps (default: the settings'); schedules run over
+        them.
+        """
         for _ in self.iterate(total_steps):
             pass
         return self
@@ -103,7 +121,9 @@ class Agent:
             yield Progress(self.steps - start, budget, metrics, episodes)
 
     def _next_columns(self, remaining: int, first: bool) -> int:
-        """Columns of the next rollout, never more than the budget allows; a crumb at the end is not learned from."""
+        """Columns of the next rollout, never more than the budget allows; a crumb at the end is not learned
+        from.
+        """
         columns = min(self.settings.num_steps, remaining // self.environments.num_envs)
         return columns if first or columns >= min(CRUMB, self.settings.num_steps) else 0
 
@@ -121,14 +141,15 @@ class Agent:
         batch = to_batch(rollout, self.engine, self.normalisers, present)
         metrics: dict[str, float] = {}
         if bool(batch.mask.any()):
-            limit = self._log_ratio_limit(batch) if check else None
+            if check:
+                self.engine_check = self.engine.check(batch, present)
             metrics = self.engine.update(
                 self.optimiser,
-                batch.as_steps(),
+                batch,
                 present,
                 self.update_rng,
                 refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
-                log_ratio_limit=limit,
+                log_ratio_limit=self._log_ratio_limit(batch) if check else None,
             )
             metrics["train/explained_variance"] = float(
                 explained_variance(batch.old_values, batch.returns, batch.mask)
@@ -139,7 +160,9 @@ class Agent:
         self.steps += rollout.steps
         finish = time.perf_counter()
         metrics |= _settings_metrics(present) | _episode_metrics(rollout)
-        metrics |= {"time/env_seconds": collected - begin, "time/update_seconds": finish - collected}
+        metrics["time/env_seconds"] = rollout.env_seconds
+        metrics["time/act_seconds"] = collected - begin - rollout.env_seconds
+        metrics["time/update_seconds"] = finish - collected
         metrics["time/fps"] = rollout.steps / (finish - begin)
         return metrics, rollout.episodes
 
@@ -169,7 +192,9 @@ class Agent:
             inputs = {**inputs, "action_mask": actions.flatten_mask(action_masks, rows)}
         elif layout.has_mask:
             inputs = {**inputs, "action_mask": actions.flatten_mask(layout.mask_of(observation), rows)}
-        tensors = {k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()}
+        tensors = {
+            k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()
+        }
         if deterministic:
             chosen = self.policy.mode(tensors)
         else:
@@ -186,17 +211,22 @@ class Agent:
         layout = self.environments.observation_layout
         batched = _is_batched(layout, observation)
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
-        tensors = {k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()}
+        tensors = {
+            k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()
+        }
         with torch.no_grad():
             values = self.policy.values(tensors).cpu().numpy()
-        values = values * (self.normalisers.rewards.deviation if self.normalisers.rewards is not None else 1.0)
+        values = values * (
+            self.normalisers.rewards.deviation if self.normalisers.rewards is not None else 1.0
+        )
         return values if batched else float(values[0])
 
     def noise(self, rows: int, rng: np.random.Generator) -> torch.Tensor:
         """Noise [rows, A] for Policy.act."""
         return torch.from_numpy(self.collector.noise(1, rows, rng)[0]).to(self.policy.device)
 
-    # ---------------------------------------------------------------------------------------- moving and saving
+    # ---------------------------------------------------------------------------------------- moving and
+    # saving
 
     def set_env(self, env: Any) -> Agent:
         """Go on learning on another environment with the same spaces (a warm start)."""
@@ -207,7 +237,9 @@ class Agent:
             seen, expected = getattr(fresh, name).space, getattr(old, name).space
             if seen != expected:
                 fresh.close()
-                raise ValueError(f"The new environment has {name[:-7]}s {seen}; this policy was made for {expected}.")
+                raise ValueError(
+                    f"The new environment has {name[:-7]}s {seen}; this policy was made for {expected}."
+                )
         self.env, self.environments = env, fresh
         if self.normalisers.rewards is not None:
             self.normalisers.rewards.restart(fresh.num_envs)
@@ -217,7 +249,9 @@ class Agent:
         return self
 
     def save(self, path: str | Path) -> Path:
-        """Write policy, optimiser, normalisers and random generators into the folder ``path``; nothing is pickled."""
+        """Write policy, optimiser, normalisers and random generators into the folder ``path``; nothing is
+        pickled.
+        """
         from tightrope.control.saving import save_agent
 
         return save_agent(self, Path(path))
@@ -251,13 +285,19 @@ AGENTS: dict[str, type[Agent]] = {"ppo": PPO, "a2c": A2C, "reinforce": Reinforce
 def _environments(env: Any, settings: TrainSettings) -> Environments:
     source = settings.env if env is None else env
     backend, workers = settings.vector_backend, settings.num_workers
-    return make_environments(source, settings.num_envs, backend=backend, num_workers=workers, squash=settings.squash)
+    return make_environments(
+        source, settings.num_envs, backend=backend, num_workers=workers, squash=settings.squash
+    )
 
 
 def _normalisers(environments: Environments, settings: TrainSettings) -> Normalisers:
     layout = environments.observation_layout
-    observations = ObservationNormaliser(layout.continuous) if settings.normalise_observations and layout.size else None
-    rewards = RewardNormaliser(environments.num_envs, settings.update.gamma) if settings.normalise_rewards else None
+    observations = (
+        ObservationNormaliser(layout.continuous) if settings.normalise_observations and layout.size else None
+    )
+    rewards = (
+        RewardNormaliser(environments.num_envs, settings.update.gamma) if settings.normalise_rewards else None
+    )
     return Normalisers(observations, rewards)
 
 
@@ -291,5 +331,3 @@ def _episode_metrics(rollout: Rollout) -> dict[str, float]:
         "rollout/ep_len_mean": float(np.mean([e[1] for e in rollout.episodes])),
         "rollout/episodes": float(len(rollout.episodes)),
     }
-
-

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
@@ -143,9 +144,8 @@ class VectorCopies:
                 f"the observations hold {describe(observations)}, expected {self.num_envs} rows"
             )
         if self.observation_layout.plain and inputs["flat"] is observations:
-            inputs = {
-                "flat": inputs["flat"].copy()
-            }  # a vector environment may write into its own array again
+            # a vector environment may write into its own array again
+            inputs = {"flat": inputs["flat"].copy()}
         return inputs
 
     def _next_step(
@@ -295,4 +295,7 @@ def _to_int32(actions: Any) -> Any:
 
 def is_vector_env(env: Any) -> bool:
     """True for Gymnasium's vector environments, and for EnvPool's, which only look like them."""
-    return isinstance(env, VectorEnv) or (hasattr(env, "single_action_space") and hasattr(env, "num_envs"))
+    if isinstance(env, VectorEnv):
+        return True
+    looks_like = hasattr(env, "single_action_space") and hasattr(env, "num_envs")
+    return looks_like and not isinstance(env, gym.Env | type)

@@ -5,6 +5,7 @@ Memory is environment-major, [B, T, ...], allocated once and filled in place.
 
 from __future__ import annotations
 
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -25,20 +26,26 @@ class BadNumbers(ValueError):
 class Rollout:
     """What happened in T steps of B environments. ``mask`` False: NEXT_STEP's reset row, not a transition.
 
-    ``inputs``: what the policy saw (normalised), ``raw``: flat observations as they came, ``rewards``: as they came.
-    ``last``: encoded observation after the last step; ``finals``: (column, rows, encoded true final observations)
-    of truncated episodes whose next row already belongs to a new episode.
+    ``inputs``: what the policy saw (normalised), ``raw``: flat observations as they came, ``rewards``: as
+    they came. ``last``: encoded observation after the last step; ``finals``: (column, rows, encoded true
+    final observations) of truncated episodes whose next row already belongs to a new episode.
     """
 
     def __init__(self, environments: Environments, num_steps: int, *, keep_raw: bool) -> None:
-        rows, layout, actions = environments.num_envs, environments.observation_layout, environments.action_layout
+        rows, layout, actions = (
+            environments.num_envs,
+            environments.observation_layout,
+            environments.action_layout,
+        )
         shape = (rows, num_steps)
         self.inputs: dict[str, Array] = {}
         if layout.size:
             self.inputs["flat"] = np.zeros((*shape, layout.size), np.float32)
         for i, image in enumerate(layout.image_shapes):
             self.inputs[f"image{i}"] = np.zeros((*shape, *image), np.uint8)
-        self.raw = np.zeros_like(self.inputs["flat"]) if keep_raw else self.inputs.get("flat", np.zeros((*shape, 0)))
+        self.raw = (
+            np.zeros_like(self.inputs["flat"]) if keep_raw else self.inputs.get("flat", np.zeros((*shape, 0)))
+        )
         self.actions = np.zeros((*shape, actions.num_columns), np.float32)
         self.logp = np.zeros(shape, np.float32)
         self.rewards = np.zeros(shape, np.float64)
@@ -49,6 +56,7 @@ class Rollout:
         self.finals: list[tuple[int, Array, dict[str, Array]]] = []
         self.episodes: list[tuple[float, int, bool]] = []
         self.reward_statistics_taken = False
+        self.env_seconds = 0.0
 
     @property
     def steps(self) -> int:
@@ -57,9 +65,13 @@ class Rollout:
 
 
 class Collector:
-    """Fills rollouts; carries observations, and the return and length of running episodes, from one to the next."""
+    """Fills rollouts; carries observations, and the return and length of running episodes, from one to the
+    next.
+    """
 
-    def __init__(self, environments: Environments, normalisers: Normalisers, rng: np.random.Generator) -> None:
+    def __init__(
+        self, environments: Environments, normalisers: Normalisers, rng: np.random.Generator
+    ) -> None:
         self.environments, self.normalisers, self.rng = environments, normalisers, rng
         self._rollout: Rollout | None = None
         self._uniform = np.concatenate(
@@ -80,11 +92,15 @@ class Collector:
             return rng.random(shape, dtype=np.float32)
         noise = rng.standard_normal(shape, dtype=np.float32)
         if self._uniform.any():
-            noise[..., self._uniform] = rng.random((num_steps, rows, int(self._uniform.sum())), dtype=np.float32)
+            noise[..., self._uniform] = rng.random(
+                (num_steps, rows, int(self._uniform.sum())), dtype=np.float32
+            )
         return noise
 
     def collect(self, engine: Any, num_steps: int) -> Rollout:
-        """Step all environments ``num_steps`` times with the engine's policy; the memory is reused by the next call."""
+        """Step all environments ``num_steps`` times with the engine's policy; the memory is reused by the
+        next call.
+        """
         keep_raw = self.normalisers.observations is not None
         rollout = self._rollout
         if rollout is None or rollout.logp.shape[1] != num_steps:
@@ -96,7 +112,7 @@ class Collector:
         rollout.finals, rollout.reward_statistics_taken = [], False
         noise = self.noise(num_steps, self.environments.num_envs, self.rng)
         engine.begin_rollout(self.environments.num_envs, self.rng)
-        inputs, action_mask, t = self._inputs, self._action_mask, 0
+        inputs, action_mask, t, env_seconds = self._inputs, self._action_mask, 0, 0.0
         try:
             for t in range(num_steps):
                 if action_mask is not None:
@@ -104,7 +120,9 @@ class Collector:
                 if keep_raw:
                     rollout.raw[:, t] = inputs["flat"]
                 engine.act(inputs, self.normalisers.observations, action_mask, noise[t], rollout, t)
+                before = perf_counter()
                 step = self.environments.step(rollout.actions[:, t])
+                env_seconds += perf_counter() - before
                 inputs, action_mask = step.inputs, step.action_mask
                 rollout.rewards[:, t] = step.rewards
                 rollout.terminated[:, t] = step.terminated
@@ -114,9 +132,11 @@ class Collector:
                 if step.final_rows is not None:
                     rollout.finals.append((t, step.final_rows, step.final_inputs))
         except Exception:
-            self._check_numbers(rollout, t + 1)  # a NaN observation is the likelier cause of what failed after it
+            self._check_numbers(
+                rollout, t + 1
+            )  # a NaN observation is the likelier cause of what failed after it
             raise
-        self._inputs, self._action_mask = inputs, action_mask
+        self._inputs, self._action_mask, rollout.env_seconds = inputs, action_mask, env_seconds
         self._check_numbers(rollout, num_steps)
         rollout.last = self.normalisers.encode(inputs)
         rollout.finals = [(t, rows, self.normalisers.encode(x)) for t, rows, x in rollout.finals]
@@ -126,7 +146,9 @@ class Collector:
         return rollout
 
     def _check_numbers(self, rollout: Rollout, num_steps: int) -> None:
-        """Raise BadNumbers naming environment, step and index of the first NaN or infinity, if there is one."""
+        """Raise BadNumbers naming environment, step and index of the first NaN or infinity, if there is
+        one.
+        """
         where = rollout.raw[:, :num_steps]
         checks = [("observation", where), ("reward", rollout.rewards[:, :num_steps, None])]
         checks += [("observation", x["flat"][:, None]) for x in [self._inputs] if "flat" in x]
@@ -138,8 +160,9 @@ class Collector:
             row, t, index = np.argwhere(~good)[0]
             raise BadNumbers(
                 f"Environment {row} of {self.environments.spec_id} returned {what} = {numbers[row, t, index]} at step "
-                f"{self._step_count + t}{f', index {index}' if what != 'reward' else ''}; expected finite numbers. "
-                "The policy was not updated with it. Mend the environment, or clip and check its state there."
+                f"{self._step_count + t}{f', index {index}' if what != 'reward' else ''}; expected finite "
+                "numbers. The policy was not updated with it. Mend the environment, or clip and check its "
+                "state there."
             )
 
     def _count_episodes(self, rollout: Rollout) -> list[tuple[float, int, bool]]:
@@ -165,7 +188,9 @@ def _columns(component: Any) -> int:
 
 
 def next_values(values: Array, rollout: Rollout, engine: Any) -> Array:
-    """V of the true next observation of every step [B, T]: also at a truncation and at the end of the rollout."""
+    """V of the true next observation of every step [B, T]: also at a truncation and at the end of the
+    rollout.
+    """
     following = np.empty_like(values)
     following[:, :-1] = values[:, 1:]
     following[:, -1] = engine.values(rollout.last)
@@ -182,7 +207,9 @@ def to_batch(rollout: Rollout, engine: Any, normalisers: Normalisers, settings: 
     if normalisers.rewards is None:
         rewards = rollout.rewards.astype(np.float32)
     else:
-        if float(normalisers.rewards.moments.count) == 0:  # nothing to scale the very first rollout by but itself
+        if (
+            float(normalisers.rewards.moments.count) == 0
+        ):  # nothing to scale the very first rollout by but itself
             normalisers.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
             rollout.reward_statistics_taken = True
         rewards = normalisers.rewards(rollout.rewards)

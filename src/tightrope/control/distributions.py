@@ -1,8 +1,9 @@
-"""From the actor's outputs to a distribution over actions: the one place that samplers and trainers both call.
+"""From the actor's outputs to a distribution over actions: the one place that samplers and trainers both
+call.
 
-An action is a row of ``num_columns`` float32 numbers: category indices, bits and Gaussian values side by side. Noise
-comes from outside (uniforms for categories and bits, standard normals for Gaussian columns), so that the compiled
-engine and this module draw the very same actions.
+An action is a row of ``num_columns`` float32 numbers: category indices, bits and Gaussian values side by
+side. Noise comes from outside (uniforms for categories and bits, standard normals for Gaussian columns), so
+that the compiled engine and this module draw the very same actions.
 """
 
 from __future__ import annotations
@@ -62,7 +63,9 @@ class Distribution:
         return torch.cat(parts, dim=1)
 
     def logp(self, actions: Tensor) -> Tensor:
-        """log pi(a) [N] of actions [N, A]; squashed: the density of the action in the environment's own units."""
+        """log pi(a) [N] of actions [N, A]; squashed: the density of the action in the environment's own
+        units.
+        """
         total = torch.zeros(len(actions), device=actions.device)
         for component in self.layout.components:
             x = actions[:, component.column : component.column + _columns(component)]

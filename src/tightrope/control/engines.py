@@ -1,10 +1,13 @@
-"""Who computes: torch, which covers everything and is the truth, or the compiled CPU engine, which repeats it.
+"""Who computes: torch, which covers everything and is the truth, or the compiled CPU engine, which repeats
+it.
 
-Both have the same face: ``act``, ``values``, ``gae`` and ``update``. The choice is a pure function of the settings.
+Both have the same face: ``act``, ``values``, ``gae`` and ``update``. The choice is a pure function of the
+settings.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,13 +15,14 @@ import torch
 
 from tightrope.algorithms import a2c, ppo, reinforce
 from tightrope.algorithms.batch import Batch
-from tightrope.algorithms.settings import UpdateSettings
+from tightrope.algorithms.settings import PPOSettings, UpdateSettings
 from tightrope.control.normalise import CLIP, ObservationNormaliser
 from tightrope.control.policies import Policy
 from tightrope.control.settings import TrainSettings
 from tightrope.maths import returns
 
 Array = np.ndarray
+CHECK_LIMIT = 1e-4
 ALGORITHMS = {"ppo": ppo, "a2c": a2c, "reinforce": reinforce}
 
 
@@ -65,7 +69,9 @@ class TorchEngine:
         """Values [N] of encoded observations [N, ...], in one pass (images in parts, to save memory)."""
         total = len(next(iter(inputs.values())))
         size = 1024 if any(name.startswith("image") for name in inputs) else total
-        parts = [self._tensors({n: x[i : i + size] for n, x in inputs.items()}) for i in range(0, total, size)]
+        parts = [
+            self._tensors({n: x[i : i + size] for n, x in inputs.items()}) for i in range(0, total, size)
+        ]
         return torch.cat([self.policy.values(part) for part in parts]).float().cpu().numpy()
 
     def gae(
@@ -80,14 +86,28 @@ class TorchEngine:
         gae_lambda: float,
     ) -> Array:
         """maths.returns.gae on arrays."""
-        tensors = [torch.from_numpy(np.ascontiguousarray(x)) for x in (rewards, values, next_values, terminated, ended)]
+        tensors = [
+            torch.from_numpy(np.ascontiguousarray(x))
+            for x in (rewards, values, next_values, terminated, ended)
+        ]
         return returns.gae(*tensors, gamma, gae_lambda, torch.from_numpy(mask)).numpy()
 
     def update(
-        self, optimiser: torch.optim.Optimizer, batch: Batch, settings: UpdateSettings, rng: np.random.Generator, **more: Any
+        self,
+        optimiser: torch.optim.Optimizer,
+        batch: Batch,
+        settings: UpdateSettings,
+        rng: np.random.Generator,
+        **more: Any,
     ) -> dict[str, float]:
-        """The algorithm's update on torch."""
-        return self.algorithm.update(self.model, optimiser, batch, settings, rng, **more)
+        """The algorithm's update on torch, step by step: memory of earlier steps is not part of a policy
+        here.
+        """
+        return self.algorithm.update(self.model, optimiser, batch.as_steps(), settings, rng, **more)
+
+    def check(self, batch: Batch, settings: UpdateSettings) -> str:
+        """Nothing to check: this is what the compiled engine is checked against."""
+        return ""
 
     def _tensors(self, inputs: dict[str, Array]) -> dict[str, torch.Tensor]:
         return {name: torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for name, x in inputs.items()}
@@ -128,14 +148,39 @@ class CompiledEngine:
         return self.fused.values(inputs["flat"])
 
     def update(
-        self, optimiser: torch.optim.Optimizer, batch: Batch, settings: UpdateSettings, rng: np.random.Generator, **more: Any
+        self,
+        optimiser: torch.optim.Optimizer,
+        batch: Batch,
+        settings: UpdateSettings,
+        rng: np.random.Generator,
+        **more: Any,
     ) -> dict[str, float]:
         """ppo.update, compiled."""
         return self.fused.update(self.policy, optimiser, batch, settings, rng, **more)
 
+    def check(self, batch: Batch, settings: UpdateSettings) -> str:
+        """One minibatch by ppo.py and by this engine, on copies: a line with the largest difference of a
+        parameter.
+
+        Raises RuntimeError when the engine does not compute what ppo.py does.
+        """
+        assert isinstance(settings, PPOSettings)
+        difference = self.fused.check_first_minibatch(batch, settings)
+        if not difference <= CHECK_LIMIT:
+            raise RuntimeError(
+                f"After one minibatch the compiled engine differs from ppo.py by {difference:.2g} in a "
+                f"parameter (limit {CHECK_LIMIT:g}). Train with --engine torch, and please report this with "
+                "your settings.json."
+            )
+        return f"engine check: one minibatch by ppo.py and compiled, largest difference of a parameter {difference:.1e}"
+
 
 def choose(
-    policy: Policy, optimiser: torch.optim.Optimizer, settings: TrainSettings, cores: int
+    policy: Policy,
+    optimiser: torch.optim.Optimizer,
+    settings: TrainSettings,
+    cores: int,
+    notify: Callable[[str], None],
 ) -> tuple[TorchEngine | CompiledEngine, str]:
     """The engine for these settings, and a line that says which and why.
 
@@ -143,15 +188,20 @@ def choose(
     """
     if settings.engine == "torch":
         return TorchEngine(policy, settings), "engine: torch, as asked"
-    from tightrope.control.engine import unsupported
+    from tightrope.control.engine import compilation_due, unsupported
 
     reason = unsupported(policy, settings.update, policy.device, settings.algorithm)
     if reason is None and settings.compile:
         reason = "--compile"
     if reason is None:
-        return CompiledEngine(policy, optimiser, threads=min(2, cores)), "engine: fused (compiled for this CPU)"
+        if compilation_due():
+            notify("compiling the CPU engine: about 15 seconds, once for this installation ...")
+        return CompiledEngine(
+            policy, optimiser, threads=min(2, cores)
+        ), "engine: fused (compiled for this CPU)"
     if settings.engine == "fused":
         raise ValueError(
-            f"engine is 'fused', which does not cover {reason}. Use --engine auto or torch, or change that setting."
+            f"engine is 'fused', which does not cover {reason}. Use --engine auto or torch, or change that "
+            "setting."
         )
     return TorchEngine(policy, settings), f"engine: torch (the compiled engine does not cover {reason})"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from tightrope.control import tasks
 from tightrope.control.environments import Environments, make_environments
 
 Array = np.ndarray
@@ -27,8 +28,9 @@ def evaluate_agent(
 ) -> dict[str, Any]:
     """Returns and lengths of ``episodes`` episodes; normalisers and weights are not touched.
 
-    Every copy plays its own fixed share of the episodes, so that short episodes are not counted more often than
-    long ones. Gives ``mean_return``, ``std_return``, ``ci95`` (half width), ``mean_length``, ``episodes``, ``returns``.
+    Every copy plays its own fixed share of the episodes, so that short episodes are not counted more often
+    than long ones. Gives ``mean_return``, ``std_return``, ``ci95`` (half width), ``mean_length``,
+    ``episodes``, ``returns``.
     """
     rows = environments.num_envs
     share = np.array([episodes // rows + (i < episodes % rows) for i in range(rows)])
@@ -51,7 +53,9 @@ def evaluate_agent(
     return _summary(found)
 
 
-def act(agent: Any, inputs: dict[str, Array], action_mask: Array | None, rng: np.random.Generator | None) -> Array:
+def act(
+    agent: Any, inputs: dict[str, Array], action_mask: Array | None, rng: np.random.Generator | None
+) -> Array:
     """Action matrix [N, A] for raw encoded inputs; ``rng`` None: the most likely actions."""
     inputs = agent.normalisers.encode(inputs)
     if action_mask is not None:
@@ -85,13 +89,13 @@ def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environme
     Raises ValueError when the environment cannot be made a second time (a vector environment, say).
     """
     if hasattr(env, "single_observation_space"):
-        raise ValueError("A vector environment cannot be copied for evaluation; pass a Gymnasium id or a factory.")
+        raise ValueError(
+            "A vector environment cannot be copied for evaluation; pass a Gymnasium id or a factory."
+        )
     source = settings.env if env is None else env
     backend = settings.vector_backend if settings.vector_backend in ("vector", "envpool") else "serial"
     if hasattr(source, "observation_space"):  # an instance trains already: evaluation needs copies, not it
-        from tightrope.control.environments import replicate
-
-        source = replicate(source)
+        source = tasks.replicas(source, 2)[1]
     return make_environments(source, min(episodes, MAX_COPIES), backend=backend, squash=settings.squash)
 
 
@@ -118,5 +122,3 @@ def evaluate_run(
     finally:
         agent.close()
     return {**result, "step": agent.steps, "seed": seed, "deterministic": not stochastic}
-
-

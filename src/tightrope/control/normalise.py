@@ -1,4 +1,6 @@
-"""Running statistics of observations and rewards: frozen during a rollout and its update, moved between them."""
+"""Running statistics of observations and rewards: frozen during a rollout and its update, moved between
+them.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,8 @@ class ObservationNormaliser:
 
 
 class RewardNormaliser:
-    """r / sqrt(Var(R) + 1e-8), clipped to +-10, where R_t = r_t + gamma R_{t-1} restarts after either kind of end.
+    """r / sqrt(Var(R) + 1e-8), clipped to +-10, where R_t = r_t + gamma R_{t-1} restarts after either kind of
+    end.
 
     The mean is not subtracted: that would change which policy is best. ``deviation`` is the scale in force.
     """
@@ -85,7 +88,12 @@ class RewardNormaliser:
         """Tensors to save."""
         running = torch.from_numpy(self.running.copy())
         moments = self.moments
-        return {"count": moments.count, "mean": moments.mean, "variance": moments.variance, "running": running}
+        return {
+            "count": moments.count,
+            "mean": moments.mean,
+            "variance": moments.variance,
+            "running": running,
+        }
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
         """Take over saved tensors."""
@@ -115,7 +123,9 @@ class Normalisers:
     def state(self) -> dict[str, torch.Tensor]:
         """All tensors, with the kind as prefix."""
         parts = {"observations": self.observations, "rewards": self.rewards}
-        return {f"{k}.{n}": x for k, part in parts.items() if part is not None for n, x in part.state().items()}
+        return {
+            f"{k}.{n}": x for k, part in parts.items() if part is not None for n, x in part.state().items()
+        }
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
         """Take over what ``state`` gave."""

@@ -25,7 +25,8 @@ def mlp(
 ) -> nn.Sequential:
     """Linear layers with the activation between them; orthogonal weights of gain sqrt 2, biases 0.
 
-    ``last_gain``: gain of the last layer, which then has no activation after it; None: all layers are hidden ones.
+    ``last_gain``: gain of the last layer, which then has no activation after it; None: all layers are hidden
+    ones.
     """
     layers: list[nn.Module] = []
     for i, (n_in, n_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
@@ -43,7 +44,8 @@ def _orthogonal(layer: Any, gain: float | None, generator: torch.Generator) -> A
 
 
 class ImageEncoder(nn.Module):
-    """Images [N, *shape] of bytes to features [N, 512]: the convolutions of Mnih et al. 2015, smaller for small images.
+    """Images [N, *shape] of bytes to features [N, 512]: the convolutions of Mnih et al. 2015, smaller for
+    small images.
 
     Channels may come first or last (the shorter of the two axes) or be missing; bytes are divided by 255.
     """
@@ -59,7 +61,10 @@ class ImageEncoder(nn.Module):
         plan = [(32, 8, 4), (64, 4, 2), (64, 3, 1)] if min(sides) >= 36 else [(16, 3, 1), (32, 3, 2)]
         layers: list[nn.Module] = []
         for width, kernel, stride in plan:
-            layers += [_orthogonal(nn.Conv2d(channels, width, kernel, stride), math.sqrt(2.0), generator), nn.ReLU()]
+            layers += [
+                _orthogonal(nn.Conv2d(channels, width, kernel, stride), math.sqrt(2.0), generator),
+                nn.ReLU(),
+            ]
             channels, sides = width, [(side - kernel) // stride + 1 for side in sides]
         linear = _orthogonal(nn.Linear(channels * math.prod(sides), 512), math.sqrt(2.0), generator)
         self.layers = nn.Sequential(*layers, nn.Flatten(), linear, nn.ReLU())
@@ -75,8 +80,8 @@ class Policy(nn.Module):
     """An actor and a critic over encoded observations; ``own`` (a user's module) takes the place of both.
 
     ``trunk`` is shared by both when settings.shared; ``encoders`` turn images into features, shared always.
-    ``own(observations) -> (parameters [N, P], values [N])`` receives observations as the space has them, batched,
-    in float32 (Discrete leaves one-hot).
+    ``own(observations) -> (parameters [N, P], values [N])`` receives observations as the space has them,
+    batched, in float32 (Discrete leaves one-hot).
     """
 
     def __init__(
@@ -115,7 +120,9 @@ class Policy(nn.Module):
             self.log_std = nn.Parameter(torch.full((features, dimensions), settings.log_std_init))
         self.gsde = bool(dimensions) and settings.std == "gsde"
         self.half_range: Tensor | None
-        self.register_buffer("half_range", _half_range(actions) if settings.squash else None, persistent=False)
+        self.register_buffer(
+            "half_range", _half_range(actions) if settings.squash else None, persistent=False
+        )
         self.exploration: Tensor | None = None
 
     @property
@@ -162,7 +169,9 @@ class Policy(nn.Module):
 
     @torch.no_grad()
     def act(self, inputs: Inputs, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Sampled actions [N, A] and their log-probabilities [N]; with gSDE the held exploration makes the noise."""
+        """Sampled actions [N, A] and their log-probabilities [N]; with gSDE the held exploration makes the
+        noise.
+        """
         distribution, latent = self._actor(inputs)
         if self.gsde and self.exploration is not None:
             assert latent is not None and self.log_std is not None and distribution.log_std is not None
@@ -197,7 +206,8 @@ class Policy(nn.Module):
             log_std = parameters[:, self.layout.num_parameters :] + self.log_std_init
             parameters = parameters[:, : self.layout.num_parameters]
         elif self.gsde:
-            # the matrix is Gaussian, so the action given the state is too: var = sum_f (phi_f std_f)^2, exactly
+            # the matrix is Gaussian, so the action given the state is too: var = sum_f (phi_f std_f)^2,
+            # exactly
             assert latent is not None and self.log_std is not None
             variance = latent.detach().square() @ (2.0 * self.log_std.clamp(-20, 2)).exp()
             log_std = 0.5 * torch.log(variance + 1e-6)
@@ -216,16 +226,23 @@ class Policy(nn.Module):
             expected += gaussian_dimensions(self.layout)
         good = isinstance(result, tuple) and len(result) == 2 and all(isinstance(x, Tensor) for x in result)
         if not good or result[0].shape != (n, expected) or result[1].numel() != n:
-            seen = [tuple(x.shape) for x in result if isinstance(x, Tensor)] if isinstance(result, tuple) else result
+            seen = (
+                [tuple(x.shape) for x in result if isinstance(x, Tensor)]
+                if isinstance(result, tuple)
+                else result
+            )
             raise ValueError(
-                f"Your policy returned {seen}; expected a pair (action parameters of shape ({n}, {expected}), "
-                f"values of shape ({n},)) for {n} observations of a task with actions {self.layout.space}."
+                f"Your policy returned {seen}; expected a pair (action parameters of shape ({n}, "
+                f"{expected}), values of shape ({n},)) for {n} observations of a task with actions "
+                f"{self.layout.space}."
             )
         return result[0], result[1].reshape(n)
 
 
 def _own_module(
-    own: nn.Module | Callable[[Any, Any], nn.Module] | None, observations: ObservationLayout, actions: ActionLayout
+    own: nn.Module | Callable[[Any, Any], nn.Module] | None,
+    observations: ObservationLayout,
+    actions: ActionLayout,
 ) -> nn.Module | None:
     if own is None or isinstance(own, nn.Module):
         return own

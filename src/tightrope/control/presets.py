@@ -91,7 +91,8 @@ def preset(
 ) -> dict[str, Any]:
     """Overrides of the defaults for a task: by its id, else by kind of action space and time limit.
 
-    ``kind`` is ``discrete``, ``continuous`` or ``images`` (observations), None when the task is not known yet.
+    ``kind`` is ``discrete``, ``continuous`` or ``images`` (observations), None when the task is not known
+    yet.
     """
     listed = BY_TASK[algorithm].get(env_id)
     if listed is not None:

@@ -25,7 +25,10 @@ def save_agent(agent: Agent, folder: Path, *, extra: dict[str, Any] | None = Non
         "kl_beta": agent.kl_beta,
         "own_policy": agent.policy.own is not None,
         "own_environment": agent.env is not None and not isinstance(agent.env, str),
-        "rng": {"sampling": agent.sampling_rng.bit_generator.state, "update": agent.update_rng.bit_generator.state},
+        "rng": {
+            "sampling": agent.sampling_rng.bit_generator.state,
+            "update": agent.update_rng.bit_generator.state,
+        },
         **(extra or {}),
     }
     return checkpoint.save(folder, tensors, state)
@@ -36,8 +39,8 @@ def load(
 ) -> Agent:
     """The agent of a run folder (its newest policy, ``best``: its best) or of a folder that ``save`` wrote.
 
-    ``env``: needed when the saved one was no plain Gymnasium id; another id is a warm start.  ``policy``: needed when
-    the saved policy was a module of your own.
+    ``env``: needed when the saved one was no plain Gymnasium id; another id is a warm start.  ``policy``:
+    needed when the saved policy was a module of your own.
     """
     folder = agent_folder(Path(path), best=best)
     tensors, state = checkpoint.load(folder)
@@ -45,7 +48,9 @@ def load(
     if device is not None:
         settings = settings.with_values(device=device)
     if state["own_policy"] and policy is None:
-        raise ValueError(f"{path} holds a policy module of your own. Pass it again: load({str(path)!r}, policy=module).")
+        raise ValueError(
+            f"{path} holds a policy module of your own. Pass it again: load({str(path)!r}, policy=module)."
+        )
     if env is None and (state["own_environment"] or ":" in settings.env):
         raise ValueError(
             f"{path} was trained on {settings.env!r}, which no file may import. Pass it again: "
@@ -53,13 +58,17 @@ def load(
         )
     if isinstance(env, str):
         settings = dataclasses.replace(settings, env=env, vector_backend="auto", num_workers=None)
-    agent = AGENTS[settings.algorithm](env if env is not None else settings.env, policy=policy, settings=settings)
+    agent = AGENTS[settings.algorithm](
+        env if env is not None else settings.env, policy=policy, settings=settings
+    )
     restore(agent, tensors, state)
     return agent
 
 
 def agent_folder(path: Path, *, best: bool = False) -> Path:
-    """The checkpoint folder inside a run, or the path itself when it is one. Raises ValueError when there is none."""
+    """The checkpoint folder inside a run, or the path itself when it is one. Raises ValueError when there is
+    none.
+    """
     if (path / "manifest.json").is_file():
         return path
     from tightrope.runs.run import Run

@@ -1,4 +1,6 @@
-"""The settings of the control story: one frozen dataclass for ``tightrope train``, the algorithm's own as a field."""
+"""The settings of the control story: one frozen dataclass for ``tightrope train``, the algorithm's own as a
+field.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,20 @@ class TrainSettings:
 
     env: str = setting("CartPole-v1", "Gymnasium id of the task.")
     algorithm: Algorithm = setting("ppo", "The update rule.", choices=tuple(ALGORITHM_SETTINGS))
-    update: UpdateSettings = dataclasses.field(default_factory=PPOSettings, metadata={"doc": "The update rule's."})
+    update: UpdateSettings = dataclasses.field(
+        default_factory=PPOSettings, metadata={"doc": "The update rule's."}
+    )
 
     total_steps: int = setting(100_000, "Agent steps to train for; never exceeded.", at_least=1)
-    seed: int = setting(0, "Seed of everything random; same seed and settings on one machine: same bits.", at_least=0)
+    seed: int = setting(
+        0, "Seed of everything random; same seed and settings on one machine: same bits.", at_least=0
+    )
     num_envs: int = setting(8, "Copies of the task that run side by side.", at_least=1)
     num_steps: int = setting(256, "Steps of each copy per rollout.", at_least=1)
 
-    hidden: tuple[int, ...] = setting((64, 64), "Widths of the hidden layers of actor and critic.", at_least=1)
+    hidden: tuple[int, ...] = setting(
+        (64, 64), "Widths of the hidden layers of actor and critic.", at_least=1
+    )
     activation: str = setting("tanh", "Between the layers.", choices=("tanh", "relu", "elu", "silu"))
     shared: bool = setting(False, "Actor and critic share their hidden layers.")
     std: str = setting(
@@ -48,10 +56,16 @@ class TrainSettings:
     )
     log_std_init: float = setting(0.0, "Log of the first deviation of Box actions.", at_least=-10, at_most=3)
     gsde_steps: int = setting(8, "With gSDE: steps for which one exploration matrix is held.", at_least=1)
-    squash: bool = setting(False, "Box actions pass through tanh onto the bounds; off: clipped to the bounds.")
+    squash: bool = setting(
+        False, "Box actions pass through tanh onto the bounds; off: clipped to the bounds."
+    )
 
-    normalise_observations: bool = setting(False, "Observations to mean 0, deviation 1 by running statistics.")
-    normalise_rewards: bool = setting(False, "Rewards divided by the running deviation of the discounted return.")
+    normalise_observations: bool = setting(
+        False, "Observations to mean 0, deviation 1 by running statistics."
+    )
+    normalise_rewards: bool = setting(
+        False, "Rewards divided by the running deviation of the discounted return."
+    )
 
     vector_backend: str = setting(
         "auto",
@@ -59,21 +73,32 @@ class TrainSettings:
         choices=("auto", "serial", "workers", "vector", "envpool"),
     )
     num_workers: int | None = setting(
-        None, "With workers: processes to spread the copies over; none: one a core, this process included.", at_least=1
+        None,
+        "With workers: processes to spread the copies over; none: one a core, this process included.",
+        at_least=1,
     )
     engine: str = setting(
-        "auto", "Who computes the update: the compiled CPU engine or torch.", choices=("auto", "fused", "torch")
+        "auto",
+        "Who computes the update: the compiled CPU engine or torch.",
+        choices=("auto", "fused", "torch"),
     )
     device: str = setting("cpu", "Torch device of the networks: cpu, cuda, cuda:1, mps.")
     threads: int | None = setting(
-        None, "CPU threads of torch and BLAS; none: 1 for MLPs (more only spin), every core for images.", at_least=1
+        None,
+        "CPU threads of torch and BLAS; none: 1 for MLPs (more only spin), every core for images.",
+        at_least=1,
     )
     compile: bool = setting(False, "Torch path: compile the model with torch.compile.")
 
     evaluate_every: float | None = setting(
-        0.05, "Fraction of the run between evaluations; none: no evaluation while training.", above=0, at_most=1
+        0.05,
+        "Fraction of the run between evaluations; none: no evaluation while training.",
+        above=0,
+        at_most=1,
     )
-    evaluation_episodes: int = setting(10, "Episodes per evaluation, deterministic, on seeds of their own.", at_least=1)
+    evaluation_episodes: int = setting(
+        10, "Episodes per evaluation, deterministic, on seeds of their own.", at_least=1
+    )
     checkpoint_every: float | None = setting(
         0.05, "Fraction of the run between checkpoints; none: only the last.", above=0, at_most=1
     )
@@ -84,26 +109,43 @@ class TrainSettings:
         check_ranges(self)
         expected = ALGORITHM_SETTINGS[self.algorithm]
         if not isinstance(self.update, expected):
-            raise ValueError(f"update is {type(self.update).__name__}; algorithm {self.algorithm} needs {expected.__name__}.")
+            raise ValueError(
+                f"update is {type(self.update).__name__}; algorithm {self.algorithm} needs "
+                f"{expected.__name__}."
+            )
         size, rollout = getattr(self.update, "minibatch_size", None), self.num_envs * self.num_steps
         if size is not None and size > rollout:
             raise ValueError(
-                f"minibatch_size is {size}, larger than a rollout of num_envs * num_steps = {self.num_envs} * "
-                f"{self.num_steps} = {rollout} steps. Choose minibatch_size <= {rollout} or collect more steps."
+                f"minibatch_size is {size}, larger than a rollout of num_envs * num_steps = {self.num_envs} "
+                f"* {self.num_steps} = {rollout} steps. Choose minibatch_size <= {rollout} or collect more "
+                "steps."
             )
 
     def risks(self) -> list[str]:
-        """What is unusual about these settings and why it is risky; they are trained as asked all the same."""
+        """What is unusual about these settings and why it is risky; they are trained as asked all the
+        same.
+        """
         update, found = self.update, []
         if isinstance(update, PPOSettings):
             if update.kl_beta is None and max(update.clip, update.clip_high or 0.0) > 0.3:
-                found.append(f"clip {max(update.clip, update.clip_high or 0.0):g} is above 0.3: the clip hardly acts and the policy can collapse. Usual: 0.1 to 0.3.")
+                found.append(
+                    f"clip {max(update.clip, update.clip_high or 0.0):g} is above 0.3: the clip hardly acts "
+                    "and the policy can collapse. Usual: 0.1 to 0.3."
+                )
             if update.num_epochs > 15:
-                found.append(f"num_epochs {update.num_epochs} is above 15: ratios drift and nearly every step is clipped. Usual: 4 to 10, or set target_kl 0.015.")
+                found.append(
+                    f"num_epochs {update.num_epochs} is above 15: ratios drift and nearly every step is "
+                    "clipped. Usual: 4 to 10, or set target_kl 0.015."
+                )
         if not update.normalise_advantages:
-            found.append("advantages are not normalised: the learning rate then depends on the scale of the rewards.")
+            found.append(
+                "advantages are not normalised: the learning rate then depends on the scale of the rewards."
+            )
         if update.max_grad_norm is None:
-            found.append("gradients are not clipped: one bad minibatch can destroy the policy. Usual: max_grad_norm 0.5.")
+            found.append(
+                "gradients are not clipped: one bad minibatch can destroy the policy. Usual: max_grad_norm "
+                "0.5."
+            )
         return found
 
     def with_values(self, **values: Any) -> TrainSettings:
@@ -159,13 +201,16 @@ def _typed_values(values: dict[str, Any], kind: type) -> dict[str, Any]:
         if name not in hints:
             near = difflib.get_close_matches(name, hints, n=1)
             raise ValueError(
-                f"{kind.__name__} has no setting named {name!r}." + (f" Did you mean {near[0]!r}?" if near else "")
+                f"{kind.__name__} has no setting named {name!r}."
+                + (f" Did you mean {near[0]!r}?" if near else "")
             )
     return {name: _typed(name, value, hints[name]) for name, value in values.items()}
 
 
 def _typed(name: str, value: Any, hint: Any) -> Any:
-    """``value`` as the type of the field: a list becomes a tuple, an int a float; ValueError for anything else."""
+    """``value`` as the type of the field: a list becomes a tuple, an int a float; ValueError for anything
+    else.
+    """
     kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
     if value is None and NoneType in kinds:
         return None

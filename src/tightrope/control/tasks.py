@@ -8,11 +8,13 @@ import difflib
 import importlib
 import importlib.util
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
+
+from tightrope.control.spaces import ActionLayout, ObservationLayout, action_layout, observation_layout
 
 # namespace or entry point module -> the module that must be there, and our extra that installs it
 EXTRAS = {
@@ -21,7 +23,12 @@ EXTRAS = {
     "ale_py": ("ale_py", "atari"),
 }
 # What third parties say while a standard task is built, and what no user can act on.
-NOISE = (r".*precision lowered by casting.*", r".*pkg_resources is deprecated.*", r".*settotalmass.*")
+NOISE = (
+    r".*precision lowered by casting.*",
+    r".*pkg_resources is deprecated.*",
+    r".*settotalmass.*",
+    r"builtin type [Ss]wig\w* has no __module__ attribute",
+)
 BOOKKEEPING = (
     "OrderEnforcing",
     "PassiveEnvChecker",
@@ -177,6 +184,35 @@ def _did_you_mean(name: str, known: Any) -> str:
     same = sorted((v for k, v in lowered.items() if k.rpartition("-v")[0] == stem), reverse=True)
     names = list(dict.fromkeys([*same, *(lowered[key] for key in close)]))[:3]
     return f" Did you mean {' or '.join(names)}?" if names else ""
+
+
+def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env]) -> None:
+    """Append one environment per maker to ``envs``; ValueError when a maker gives something else or one
+    twice.
+    """
+    for maker in makers:
+        env = maker()
+        if not isinstance(env, gym.Env):
+            raise ValueError(f"the factory returned a {type(env).__name__}; expected a gymnasium.Env.")
+        if any(env is other for other in envs):
+            raise ValueError(
+                f"the factory returned the same object twice ({env}); each call must build a new environment."
+            )
+        envs.append(env)
+
+
+def check_alike(
+    envs: Sequence[gym.Env], observations: ObservationLayout, actions: ActionLayout, name: str
+) -> None:
+    """ValueError when the copies do not all have observations and actions of the same shape."""
+    for env in envs:
+        other, theirs = observation_layout(env.observation_space), action_layout(env.action_space)
+        same = (observations.size, observations.image_shapes) == (other.size, other.image_shapes)
+        if not same or theirs.components != actions.components:
+            raise ValueError(
+                f"the copies of {name} differ: {env.observation_space}, {env.action_space} against "
+                f"{observations.space}, {actions.space}. All copies must have the same spaces."
+            )
 
 
 def replicas(env: gym.Env, num_envs: int) -> list[Callable[[], gym.Env]]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.agent import AGENTS, Agent, Progress
 from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
 from tightrope.control.saving import restore, save_agent
@@ -24,6 +26,10 @@ def _silent(event: str, data: dict[str, Any]) -> None:
     """The reporter that says nothing."""
 
 
+def _notice(report: Reporter) -> Callable[[str], None]:
+    return lambda text: report("line", {"text": text})
+
+
 def train(
     settings: TrainSettings,
     *,
@@ -35,7 +41,8 @@ def train(
     """Train from the start; returns the summary that is also written to the run folder."""
     for risk in settings.risks():
         report("line", {"text": f"warning: {risk}"})
-    agent = AGENTS[settings.algorithm](settings.env if env is None else env, policy=policy, settings=settings)
+    source = settings.env if env is None else env
+    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=_notice(report))
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
     run = Run.create(run_dir, settings_to_json(settings), name, tensorboard=settings.tensorboard)
@@ -60,16 +67,22 @@ def resume(
     if env is None and (state["own_environment"] or ":" in settings.env):
         raise ValueError(
             f"{run_dir} was trained on {settings.env!r}, which no file may import. Name your code again: "
-            f"tightrope resume {run_dir} --env-module FILE.py."
+            f"tightrope resume {run_dir} --env {settings.env}, with --env-module FILE.py where it is "
+            "registered there."
         )
     if total_steps is not None:
         settings = settings.with_values(total_steps=total_steps)
-    agent = AGENTS[settings.algorithm](settings.env if env is None else env, policy=policy, settings=settings)
+    source = settings.env if env is None else env
+    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=_notice(report))
     restore(agent, tensors, state)
     run.rewind(agent.steps)
     if agent.steps + settings.num_envs > settings.total_steps:
-        report("line", {"text": f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there."})
-    return _continue(agent, run, settings.total_steps, report, best=state["best"], wall=state["wall_seconds"])
+        report(
+            "line",
+            {"text": f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there."},
+        )
+    best = float("-inf") if state["best"] is None else state["best"]
+    return _continue(agent, run, settings.total_steps, report, best=best, wall=state["wall_seconds"])
 
 
 def _continue(
@@ -78,25 +91,41 @@ def _continue(
     """The loop: update -> record -> evaluate -> save, until the budget is spent."""
     settings = agent.settings
     evaluator = _Evaluator(agent, run, report, best)
-    lines = [agent.engine_line, f"environments: {agent.environments.num_envs} x {settings.env}, {agent.environments.backend}"]
-    report("start", {"settings": settings_to_json(settings), "run_dir": str(run.path), "lines": lines})
+    lines = [
+        agent.engine_line,
+        f"environments: {agent.environments.num_envs} x {settings.env}, {agent.environments.backend}",
+    ]
+    start = {
+        "settings": settings_to_json(settings),
+        "run_dir": str(run.path),
+        "lines": lines,
+        "step": agent.steps,
+    }
+    report("start", start)
     evaluate_at = _grid(settings.evaluate_every, total_steps, agent.steps)
     save_at = _grid(settings.checkpoint_every, total_steps, agent.steps)
-    updates = agent.iterate(total_steps, start=0)
-    begin_steps, first_wall = agent.steps, wall
+    updates, interrupt = agent.iterate(total_steps, start=0), Interrupt()
+    begin_steps, first_wall, first_line_said = agent.steps, wall, False
     try:
         clock = time.perf_counter()
-        for progress in updates:
+        for progress in interrupt.between(updates):
             wall += time.perf_counter() - clock
+            if agent.engine_check and not first_line_said:
+                report("line", {"text": agent.engine_check})
+                first_line_said = True
             metrics = dict(progress.metrics)
             run.record_episodes(
-                {"step": agent.steps, "return": r, "length": n, "terminated": t} for r, n, t in progress.episodes
+                {"step": agent.steps, "return": r, "length": n, "terminated": t}
+                for r, n, t in progress.episodes
             )
             if evaluate_at and agent.steps >= evaluate_at[0]:
                 evaluate_at = [step for step in evaluate_at if step > agent.steps]
                 metrics |= evaluator.evaluate(wall)
             run.record(agent.steps, wall, metrics)
-            report("update", {"step": agent.steps, "total_steps": total_steps, "metrics": metrics, "seconds": wall})
+            report(
+                "update",
+                {"step": agent.steps, "total_steps": total_steps, "metrics": metrics, "seconds": wall},
+            )
             if save_at and agent.steps >= save_at[0]:
                 save_at = [step for step in save_at if step > agent.steps]
                 _save(agent, run, evaluator.best, wall)
@@ -127,8 +156,38 @@ def _continue(
     return summary
 
 
+class Interrupt:
+    """Ctrl-C waits for the end of the update under way, so that what is saved is whole; a second one does not
+    wait.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def _ask(self, number: int, frame: Any) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def between(self, updates: Iterator[Progress]) -> Iterator[Progress]:
+        """The updates, and KeyboardInterrupt after the first that was under way when Ctrl-C came."""
+        if threading.current_thread() is not threading.main_thread():
+            yield from updates  # only the main thread may handle signals
+            return
+        before = signal.signal(signal.SIGINT, self._ask)
+        try:
+            for progress in updates:
+                yield progress
+                if self.asked:
+                    raise KeyboardInterrupt
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+
 class _Evaluator:
-    """Periodic evaluation, outside the clock; keeps the best policy. Off when the environment cannot be copied."""
+    """Periodic evaluation, outside the clock; keeps the best policy. Off when the environment cannot be
+    copied.
+    """
 
     def __init__(self, agent: Agent, run: Run, report: Reporter, best: float) -> None:
         self.agent, self.run, self.report, self.best = agent, run, report, best
@@ -163,7 +222,9 @@ class _Evaluator:
 
 
 def _grid(fraction: float | None, total_steps: int, past: int) -> list[int]:
-    """Steps at which something is due: multiples of the fraction of the run, those still ahead, the end left out."""
+    """Steps at which something is due: multiples of the fraction of the run, those still ahead, the end left
+    out.
+    """
     if fraction is None:
         return []
     points = [round(total_steps * fraction * k) for k in range(1, int(1.0 / fraction) + 1)]

@@ -36,6 +36,7 @@ from tightrope.control.spaces import (
     action_layout,
     observation_layout,
 )
+from tightrope.control.tasks import check_alike, make_all
 from tightrope.control.vector import EnvGroup, EnvironmentFault, Slots, Step
 
 COMMAND = struct.Struct("<cq")  # what to do (r = reset, s = step, c = close) and the seed of a reset
@@ -44,6 +45,7 @@ READY, MASKED, BROKEN = b"k", b"m", b"e"  # replies: fine, fine and there are ac
 PATIENCE = 60.0  # seconds a worker may stay silent
 SPIN = 2e-4  # seconds to look for a message before sleeping; to wake a sleeper costs about as much as a step
 
+_yield_core: Callable[[], Any] = getattr(os, "sched_yield", int)  # int() where there is nothing to call
 _parent_ends: weakref.WeakSet[socket.socket] = weakref.WeakSet()
 
 
@@ -159,35 +161,6 @@ class EnvCopies:
         self._workers = []
 
 
-def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env]) -> None:
-    """Append one environment per maker to ``envs``; ValueError when a maker gives something else or one
-    twice.
-    """
-    for maker in makers:
-        env = maker()
-        if not isinstance(env, gym.Env):
-            raise ValueError(f"the factory returned a {type(env).__name__}; expected a gymnasium.Env.")
-        if any(env is other for other in envs):
-            raise ValueError(
-                f"the factory returned the same object twice ({env}); each call must build a new environment."
-            )
-        envs.append(env)
-
-
-def check_alike(
-    envs: Sequence[gym.Env], observations: ObservationLayout, actions: ActionLayout, name: str
-) -> None:
-    """ValueError when the copies do not all have observations and actions of the same shape."""
-    for env in envs:
-        other, theirs = observation_layout(env.observation_space), action_layout(env.action_space)
-        same = (observations.size, observations.image_shapes) == (other.size, other.image_shapes)
-        if not same or theirs.components != actions.components:
-            raise ValueError(
-                f"the copies of {name} differ: {env.observation_space}, {env.action_space} against "
-                f"{observations.space}, {actions.space}. All copies must have the same spaces."
-            )
-
-
 class Worker:
     """This process's end of one worker."""
 
@@ -292,6 +265,7 @@ def _receive_soon(channel: socket.socket, length: int, spin: float) -> bytes:
         while time.perf_counter() < give_up:
             with contextlib.suppress(BlockingIOError):
                 return channel.recv(length, socket.MSG_DONTWAIT)
+            _yield_core()  # to whoever has work: without it a busy machine is slowed down twofold
     return channel.recv(length, socket.MSG_WAITALL)
 
 

@@ -5,12 +5,13 @@ Never ``fastmath=True``: it promises the compiler that no NaN exists and makes e
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import os
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,39 @@ import llvmlite.binding as llvm
 import numba
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, codegen
 from numba.extending import get_cython_function_address, intrinsic
 from numba.np import arrayobj
 
 FLAGS = {"contract", "reassoc", "arcp", "nsz", "afn"}
 SWITCH = "TIGHTROPE_NUMBA_CACHE"
 
-# Sums and products over rows: the compiler may reorder them (always in the same way).
-kernel = numba.njit(nogil=True, error_model="numpy", fastmath=FLAGS)
-# Element functions whose rounding steps carry their accuracy: only a multiply and its addition may be fused.
-element = numba.njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+OPTIONS = {
+    "nogil": True,
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
+    "_nrt": False,
+}  # nothing is allocated
+
+_LATE: set[str] = set()  # names of functions that are optimised within their callers alone
+
+
+def kernel(function: Any) -> Any:
+    """Compile loops over rows; the compiler may reorder their sums and products (always in the same way)."""
+    return numba.njit(fastmath=FLAGS, no_cpython_wrapper=True, **OPTIONS)(function)
+
+
+def glue(function: Any) -> Any:
+    """Compile a function that mostly calls others."""
+    _LATE.add(function.__name__)
+    return kernel(function)
+
+
+def element(function: Any) -> Any:
+    """Compile a function of one number whose rounding steps carry its accuracy: no reordering, fused multiply-add only."""
+    _LATE.add(function.__name__)
+    return numba.njit(fastmath={"contract"}, forceinline=True, no_cpython_wrapper=True, **OPTIONS)(function)
+
 
 llvm.add_symbol("tightrope_sgemm", get_cython_function_address("scipy.linalg.cython_blas", "sgemm"))
 _LIBRARY = ctypes.WinDLL("kernel32") if sys.platform == "win32" else ctypes.CDLL(None)
@@ -78,16 +101,40 @@ def mark_complete() -> None:
         (folder / "complete").touch(mode=0o600)
 
 
+@contextlib.contextmanager
+def _late_optimisation() -> Iterator[None]:
+    """Leave glue and element functions as they are until they stand in their callers.
+
+    numba optimises each function, and again all it calls within each caller, which takes most of the compile time.
+    Where a version of numba has other insides, it goes its own way and only takes longer.
+    """
+    original = getattr(codegen.CPUCodeLibrary, "_optimize_final_module", None)
+
+    def optimise(library: Any) -> None:
+        if library.name not in _LATE:
+            original(library)  # type: ignore[misc]
+
+    if original is not None:
+        codegen.CPUCodeLibrary._optimize_final_module = optimise
+    try:
+        yield
+    finally:
+        if original is not None:
+            codegen.CPUCodeLibrary._optimize_final_module = original
+
+
 def entry(signature: str) -> Callable[[Any], Any]:
     """Compile a function that Python calls, with this signature alone, now or from the cache."""
     folder = cache_folder()
 
     def compile_now(function: Any) -> Any:
         earlier = numba.config.CACHE_DIR
-        numba.config.CACHE_DIR = "" if folder is None else str(folder)  # read when the cache of a function is made
+        numba.config.CACHE_DIR = (
+            "" if folder is None else str(folder)
+        )  # read when the cache of a function is made
         try:
-            options = {"nogil": True, "error_model": "numpy", "fastmath": FLAGS}
-            return numba.njit(signature, cache=folder is not None, **options)(function)
+            with _late_optimisation():
+                return numba.njit(signature, cache=folder is not None, fastmath=FLAGS, **OPTIONS)(function)
         finally:
             numba.config.CACHE_DIR = earlier
 
@@ -96,6 +143,16 @@ def entry(signature: str) -> Callable[[Any], Any]:
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, offset: Any) -> Any:
     return builder.gep(context.make_array(kind)(context, builder, array).data, [offset])
+
+
+@intrinsic
+def plain(typing: Any, constant: Any) -> Any:
+    """A constant handed on as a variable: numba compiles a function anew for every literal argument."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return context.cast(builder, arguments[0], signature.args[0], signature.return_type)
+
+    return types.unliteral(constant)(constant), generate
 
 
 @intrinsic
@@ -117,7 +174,9 @@ def row(typing: Any, array: Any, offset: Any, count: Any) -> Any:
 @intrinsic
 def gemm(typing: Any, ta: Any, tb: Any, m: Any, n: Any, k: Any, a: Any, b: Any, beta: Any, c: Any) -> Any:
     """BLAS sgemm, column-major: C [m, n] = op(A) op(B) + beta C; a, b, c are (vector, offset, leading dimension)."""
-    signature = types.void(types.boolean, types.boolean, types.intp, types.intp, types.intp, a, b, types.float32, c)
+    signature = types.void(
+        types.boolean, types.boolean, types.intp, types.intp, types.intp, a, b, types.float32, c
+    )
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         integer, real, byte = ir.IntType(32), ir.FloatType(), ir.IntType(8)

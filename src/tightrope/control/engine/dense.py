@@ -9,7 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from tightrope.control.engine.compiled import bits_of_float, element, float_of_bits, gemm, kernel, row
+from tightrope.control.engine.compiled import (
+    bits_of_float,
+    element,
+    float_of_bits,
+    gemm,
+    glue,
+    kernel,
+    plain,
+    row,
+)
 
 BLOCK = 128  # rows worked on at once: sums are made block by block, so this number is part of the bits
 NARROW = 8  # BLAS does not pay below
@@ -84,6 +93,13 @@ def tanh(x):
     q = q * s + f(2.26843463243900e-03)
     q = q * s + f(4.89352518554385e-03)
     return y * p / q
+
+
+@element
+def finite(x):
+    """Whether a float32 is neither NaN nor infinite, read from its bits: reassociation turns x - x and 0 * x into 0,
+    and np.isfinite with them, NaN or not."""
+    return (bits_of_float(x) & np.int32(0x7F800000)) != np.int32(0x7F800000)
 
 
 @kernel
@@ -168,7 +184,7 @@ def activate(flat, layers, layer, work, n):
                 z[i] += b
 
 
-@kernel
+@glue
 def forward(flat, layers, first, last, work, n):
     """Fill the VALUE of layers first .. last - 1; layer ``first`` reads what its FEED says (-1: the inputs at 0)."""
     for layer in range(first, last):
@@ -176,10 +192,20 @@ def forward(flat, layers, first, last, work, n):
         feed, at = layers[layer, FEED], layers[layer, VALUE]
         source = layers[feed, VALUE] if feed >= 0 else 0
         weight = layers[layer, WEIGHT]
-        if min(inputs, outputs) > NARROW:
-            gemm(False, False, n, outputs, inputs, (work, source, n), (flat, weight, inputs), ZERO, (work, at, n))
+        if inputs > NARROW and outputs > NARROW:
+            gemm(
+                False,
+                False,
+                n,
+                outputs,
+                inputs,
+                (work, source, n),
+                (flat, weight, inputs),
+                ZERO,
+                (work, at, n),
+            )
         else:
-            combine(flat, weight, inputs, 1, work, source, inputs, at, outputs, n, False)
+            combine(flat, weight, inputs, plain(1), work, source, inputs, at, outputs, n, plain(False))
         activate(flat, layers, layer, work, n)
 
 
@@ -187,7 +213,10 @@ def forward(flat, layers, first, last, work, n):
 def descend(layers, layer, work, n):
     """Turn the gradient by the layer's value, at DELTA, into that by the sum before its activation."""
     kind, at = layers[layer, ACTIVATION], layers[layer, VALUE]
-    g, h = row(work, layers[layer, DELTA], layers[layer, OUTPUTS] * n), row(work, at, layers[layer, OUTPUTS] * n)
+    g, h = (
+        row(work, layers[layer, DELTA], layers[layer, OUTPUTS] * n),
+        row(work, at, layers[layer, OUTPUTS] * n),
+    )
     if kind == TANH:
         for i in range(len(g)):
             g[i] *= ONE - h[i] * h[i]
@@ -215,7 +244,7 @@ def backward(flat, grad, layers, first, last, work, n, more, join):
         inputs, outputs = layers[layer, INPUTS], layers[layer, OUTPUTS]
         feed, delta = layers[layer, FEED], layers[layer, DELTA]
         source = layers[feed, VALUE] if feed >= 0 else 0
-        weight, wide = layers[layer, WEIGHT], min(inputs, outputs) > NARROW
+        weight, wide = layers[layer, WEIGHT], inputs > NARROW and outputs > NARROW
         bias = row(grad, layers[layer, BIAS], outputs)
         for j in range(outputs):
             g, s = row(work, delta + j * n, n), ZERO
@@ -224,7 +253,17 @@ def backward(flat, grad, layers, first, last, work, n, more, join):
             bias[j] = bias[j] + s if more else s
         if wide:
             beta = ONE if more else ZERO
-            gemm(True, False, inputs, outputs, n, (work, source, n), (work, delta, n), beta, (grad, weight, inputs))
+            gemm(
+                True,
+                False,
+                inputs,
+                outputs,
+                n,
+                (work, source, n),
+                (work, delta, n),
+                beta,
+                (grad, weight, inputs),
+            )
         else:
             correlate(grad, weight, work, delta, outputs, source, inputs, n, more)
         if feed < 0:
@@ -232,6 +271,16 @@ def backward(flat, grad, layers, first, last, work, n, more, join):
         below, add = layers[feed, DELTA], join and layer == first
         if wide:
             beta = ONE if add else ZERO
-            gemm(False, True, n, inputs, outputs, (work, delta, n), (flat, weight, inputs), beta, (work, below, n))
+            gemm(
+                False,
+                True,
+                n,
+                inputs,
+                outputs,
+                (work, delta, n),
+                (flat, weight, inputs),
+                beta,
+                (work, below, n),
+            )
         else:
-            combine(flat, weight, 1, inputs, work, delta, outputs, below, inputs, n, add)
+            combine(flat, weight, plain(1), inputs, work, delta, outputs, below, inputs, n, add)

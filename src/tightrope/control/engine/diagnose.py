@@ -11,7 +11,9 @@ ADVICE = "That step was not taken and the weights are as before it."
 NAMES = ("observation", "action mask", "action", "old_logp", "old value", "advantage", "return")
 
 
-def describe(engine: Any, columns: list[np.ndarray], rows: np.ndarray, epoch: int, number: int, steps: int) -> str:
+def describe(
+    engine: Any, columns: list[np.ndarray], rows: np.ndarray, epoch: int, number: int, steps: int
+) -> str:
     """One message for a minibatch of these rows of the flattened [B, T] batch (``steps`` = T)."""
     where = f"in minibatch {number + 1} of epoch {epoch + 1}"
     for name, parameter in engine.policy.named_parameters():

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,8 @@ from tightrope.control.engine import compiled, diagnose, plan
 
 _began = time.perf_counter()
 _cold = compiled.compilation_due()
-from tightrope.control.engine import infer, threads  # noqa: E402  (these two imports compile)
+from tightrope.control.engine import infer  # noqa: E402  (this import and the last one compile)
+from tightrope.control.engine import threads as helping  # noqa: E402
 from tightrope.control.engine import update as kernels  # noqa: E402
 
 compiled.mark_complete()
@@ -46,7 +48,7 @@ class FusedEngine:
         self._moment, self._square = plan.aligned_zeros(self._plan.size), plan.aligned_zeros(self._plan.size)
         self._steps = np.zeros(len(self._plan.parameters), np.float32)
         self._work = [plan.aligned_zeros(self._plan.work_size)]
-        self._helper = _threads_helper()
+        self._helper, self._pace = helping.Helper(), Pace(both=threads > 1 and policy.trunk is None)
         # products this small gain nothing from more threads, and threads that spin take the core of the other half
         self._limit = threadpoolctl.threadpool_limits(1, user_api="blas")
         self.attach()
@@ -57,7 +59,9 @@ class FusedEngine:
         with torch.no_grad():
             for i, (parameter, at) in enumerate(self._plan.parameters):
                 if id(parameter) not in known:
-                    raise ValueError("The optimiser does not hold all parameters of the policy; build it from that policy.")
+                    raise ValueError(
+                        "The optimiser does not hold all parameters of the policy; build it from that policy."
+                    )
                 parameter.data = self._view(self._flat, parameter.data, at)
                 state = self.optimiser.state[parameter]
                 for name, memory in (("exp_avg", self._moment), ("exp_avg_sq", self._square)):
@@ -125,7 +129,9 @@ class FusedEngine:
         flags = [np.ascontiguousarray(x, bool) for x in (terminated, ended, mask)]
         out = np.empty(numbers[0].shape, np.float32)
         if any(x.shape != out.shape for x in (*numbers, *flags)):
-            raise ValueError(f"All arrays of gae must have one shape; got {[x.shape for x in (*numbers, *flags)]}.")
+            raise ValueError(
+                f"All arrays of gae must have one shape; got {[x.shape for x in (*numbers, *flags)]}."
+            )
         infer.gae(*numbers, *flags, gamma, gae_lambda, out)
         return out
 
@@ -147,18 +153,22 @@ class FusedEngine:
         if model is not self.policy or optimiser is not self.optimiser:
             raise ValueError("This engine was made for another policy or optimiser; make one for these.")
         if extra_loss is not None or settings.recompute_advantages:
-            raise ValueError("The compiled engine knows no extra_loss and no recompute_advantages; use ppo.update.")
+            raise ValueError(
+                "The compiled engine knows no extra_loss and no recompute_advantages; use ppo.update."
+            )
         self.attach()
-        rows = _rows(batch)
-        columns = _columns(batch)
+        rows, columns = _rows(batch), _columns(batch)
         run = _Run(self, columns, self._options(settings, log_ratio_limit))
-        status = run.epochs(rows, rng, settings.num_epochs)
+        with self._pace.timed(run) as together:
+            status = run.epochs(rows, rng, settings.num_epochs, together)
         self._steps += np.float32(run.ledgers[0, kernels.STEPS])
         if status == kernels.NOT_FINITE:
             at = int(run.ledgers[0, kernels.AT])
             number = at // settings.minibatch_size
             there = run.order[at : at + settings.minibatch_size]
-            raise NonFiniteError(diagnose.describe(self, columns, there, run.epoch, number, batch.mask.shape[1]))
+            raise NonFiniteError(
+                diagnose.describe(self, columns, there, run.epoch, number, batch.mask.shape[1])
+            )
         if status == kernels.MISMATCH:
             raise SamplingMismatch(diagnose.mismatch(run.ledgers[0, kernels.FIRST], log_ratio_limit))
         return run.metrics()
@@ -170,7 +180,9 @@ class FusedEngine:
         for half, (begin, end) in enumerate(self._plan.halves):
             mine = [groups[id(p)] for p, at in self._plan.parameters if begin <= at < end]
             if any(group["lr"] != mine[0]["lr"] for group in mine):
-                raise ValueError("The compiled engine needs one learning rate for the actor and one for the critic.")
+                raise ValueError(
+                    "The compiled engine needs one learning rate for the actor and one for the critic."
+                )
             options[k.RATE + half] = float(mine[0]["lr"])
             options[k.ACTOR_FROM + 2 * half], options[k.ACTOR_TO + 2 * half] = begin, end
         first = self.optimiser.param_groups[0]
@@ -208,12 +220,43 @@ class FusedEngine:
         FusedEngine(policy, optimiser, 1).update(policy, optimiser, batch, settings, np.random.default_rng(0))
 
 
+class Pace:
+    """Whether the second thread helps: on a machine whose cores are busy it costs more than it brings.
+
+    Both ways are timed, and the quicker one is taken; every ``RETRY`` updates the other is tried again. The result
+    is the same bit for bit, or a timing would have no business here.
+    """
+
+    RETRY = 16
+
+    def __init__(self, both: bool) -> None:
+        self.both, self.updates = both, 0
+        self.seconds: dict[bool, float] = {}
+
+    def choose(self) -> bool:
+        """True: two threads in the next update."""
+        if not self.both or len(self.seconds) < 2:
+            return self.both and True not in self.seconds
+        quicker = self.seconds[True] <= self.seconds[False]
+        return not quicker if self.updates % self.RETRY == 0 else quicker
+
+    @contextlib.contextmanager
+    def timed(self, run: _Run) -> Iterator[bool]:
+        """Choose, and book the time per minibatch of what happens inside."""
+        together, began = self.choose(), time.perf_counter()
+        yield together
+        steps = run.ledgers[0, kernels.NORM_COUNT]
+        self.updates += 1
+        if steps > 0:
+            self.seconds[together] = (time.perf_counter() - began) / steps
+
+
 class _Run:
     """One update under way."""
 
     def __init__(self, engine: FusedEngine, columns: list[Array], options: Array) -> None:
         self.engine, self.columns, self.options = engine, columns, options
-        self.control = np.zeros(threads.CONTROL_SIZE, np.int64)
+        self.control = np.zeros(helping.CONTROL_SIZE, np.int64)
         self.exchange, self.ledgers = np.zeros(4 * kernels.LEDGER), np.zeros((4, kernels.LEDGER))
         self.ledgers[0, [kernels.SMALLEST, kernels.LARGEST]] = np.inf, -np.inf
         self.epoch, self.order = 0, np.zeros(0, np.int64)
@@ -226,32 +269,35 @@ class _Run:
             *self.columns, self.order, self.options, self.control, self.exchange, self.ledgers,
         )  # fmt: skip
 
-    def epochs(self, rows: Array | int, rng: np.random.Generator, num_epochs: int) -> int:
-        """Run all epochs; returns why it stopped. A permutation is drawn only when its epoch begins."""
+    def epochs(self, rows: Array | int, rng: np.random.Generator, num_epochs: int, together: bool) -> int:
+        """Run all epochs; returns why it stopped. A permutation is drawn only when its epoch begins.
+
+        ``together``: the critic's half on the helping thread, should there be one.
+        """
         count = rows if isinstance(rows, int) else len(rows)
         self.order = np.empty(count, np.int64)
         job: Callable[[], object] = lambda: self._call(kernels.CRITIC, 0, 0, num_epochs)  # noqa: E731
-        role = kernels.ACTOR if self._helped(job) else kernels.BOTH
+        role = kernels.ACTOR if together and self._helped(job) else kernels.BOTH
         status = kernels.RUNNING
         try:
             for self.epoch in range(num_epochs):
                 permutation = rng.permutation(count)
                 self.order[:] = permutation if isinstance(rows, int) else rows[permutation]
                 status = self._call(role, 0, self.epoch, self.epoch + 1)
-                if status == kernels.ALONE:  # the helper is gone: the books go back, and this thread does both halves
+                if (
+                    status == kernels.ALONE
+                ):  # the helper is gone: the books go back, and this thread does both halves
                     role = kernels.BOTH
                     self.ledgers[:2] = self.ledgers[2:]
                     status = self._call(role, int(self.ledgers[0, kernels.AT]), self.epoch, self.epoch + 1)
                 if status != kernels.RUNNING:
                     break
         finally:
-            self.control[threads.LEFT] = 1
+            self.control[helping.LEFT] = 1
         return status
 
     def _helped(self, job: Callable[[], object]) -> bool:
         engine = self.engine
-        if engine.threads < 2 or engine.policy.trunk is not None:
-            return False
         if len(engine._work) < 2:
             engine._work.append(plan.aligned_zeros(engine._plan.work_size))
         return engine._helper.start(job, self.control)
@@ -277,10 +323,6 @@ class _Run:
         return {f"train/{name}": float(value) for name, value in means.items()}
 
 
-def _threads_helper() -> threads.Helper:
-    return threads.Helper()
-
-
 def _float(array: Array) -> Array:
     return np.ascontiguousarray(array, np.float32)
 
@@ -302,4 +344,9 @@ def _columns(batch: Batch) -> list[Array]:
     mask = batch.inputs.get("action_mask")
     masks = _NO_MASK if mask is None else np.ascontiguousarray(mask.reshape(steps, -1).numpy(), bool)
     numbers = (batch.old_logp, batch.old_values, batch.advantages, batch.returns)
-    return [flat(batch.inputs["flat"], True), masks, flat(batch.actions, True), *(flat(x, False) for x in numbers)]
+    return [
+        flat(batch.inputs["flat"], True),
+        masks,
+        flat(batch.actions, True),
+        *(flat(x, False) for x in numbers),
+    ]

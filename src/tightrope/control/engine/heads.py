@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tightrope.control.engine.compiled import kernel, row
+from tightrope.control.engine.compiled import glue, kernel, row
 from tightrope.control.engine.dense import BLOCK, ONE, ZERO, exp, f, log
 
 # columns of the table of heads
@@ -22,14 +22,16 @@ LOGITS, DELTAS, LOGS, ACTIONS, PENALTY, ENTROPIES, ROWS = range(7)
 PLACES = 18
 
 # vectors of one number a row, BLOCK apart, from places[ROWS]
-LOGP, TOTAL_ENTROPY, OLD_LOGP, ADVANTAGE, COEFFICIENT, TOP, SUM, OWN, RETURN, OLD_VALUE, ERROR, RATIO = range(12)
+LOGP, TOTAL_ENTROPY, OLD_LOGP, ADVANTAGE, COEFFICIENT, TOP, SUM, OWN, RETURN, OLD_VALUE, ERROR, RATIO = range(
+    12
+)
 VECTORS = 12
 
 LOG_ROOT_TWO_PI = f(0.9189385332046727)
 LOG_STD_LOW, LOG_STD_HIGH = f(-20.0), f(2.0)
 
 
-@kernel
+@glue
 def clamp_log_std(x):
     """The log deviation within its range; NaN stays NaN."""
     y = LOG_STD_LOW if x < LOG_STD_LOW else x
@@ -72,11 +74,22 @@ def normalise_logits(places, work, first, count, n):
 @kernel
 def categorical(places, head, work, n):
     """logp and entropy of one choice; LOGS keeps every log-probability."""
-    first, count, saved = places[LOGITS] + head[PARAMETER] * n, head[COUNT], places[LOGS] + head[PARAMETER] * n
+    first, count, saved = (
+        places[LOGITS] + head[PARAMETER] * n,
+        head[COUNT],
+        places[LOGS] + head[PARAMETER] * n,
+    )
     normalise_logits(places, work, first, count, n)
     vectors = places[ROWS]
-    top, total, own = row(work, vectors + TOP * BLOCK, n), row(work, vectors + SUM * BLOCK, n), row(work, vectors + OWN * BLOCK, n)
-    h, chosen = row(work, places[ENTROPIES] + head[ENTROPY] * n, n), row(work, places[ACTIONS] + head[COLUMN] * n, n)
+    top, total, own = (
+        row(work, vectors + TOP * BLOCK, n),
+        row(work, vectors + SUM * BLOCK, n),
+        row(work, vectors + OWN * BLOCK, n),
+    )
+    h, chosen = (
+        row(work, places[ENTROPIES] + head[ENTROPY] * n, n),
+        row(work, places[ACTIONS] + head[COLUMN] * n, n),
+    )
     for i in range(n):
         own[i] = f(np.nan)  # an action that is no category has no probability
         h[i] = ZERO
@@ -134,7 +147,7 @@ def gaussian(places, head, flat, work, n):
             entropy[i] += constant + f(0.5)
 
 
-@kernel
+@glue
 def evaluate(places, heads, flat, work, n, masked):
     """LOGP and TOTAL_ENTROPY of the block's actions: sums over the components."""
     logp = row(work, places[ROWS] + LOGP * BLOCK, n)
@@ -167,7 +180,11 @@ def gradient(places, heads, flat, grad, work, n, entropy_share):
         h = row(work, places[ENTROPIES] + heads[j, ENTROPY] * n, n)
         for k in range(heads[j, COUNT]):
             at = (heads[j, PARAMETER] + k) * n
-            z, s, g = row(work, places[LOGITS] + at, n), row(work, places[LOGS] + at, n), row(work, places[DELTAS] + at, n)
+            z, s, g = (
+                row(work, places[LOGITS] + at, n),
+                row(work, places[LOGS] + at, n),
+                row(work, places[DELTAS] + at, n),
+            )
             a = row(work, places[ACTIONS] + (heads[j, COLUMN] + column * k) * n, n)
             if kind == CATEGORICAL:
                 index = f(k)

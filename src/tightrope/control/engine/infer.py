@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tightrope.control.engine import heads as h
-from tightrope.control.engine.compiled import entry, row
+from tightrope.control.engine.compiled import entry, plain, row
 from tightrope.control.engine.dense import BLOCK, VALUE, ZERO, f, forward
 
 
@@ -19,7 +19,7 @@ def act(
     """Normalise, run the actor, sample, and write actions, log-probabilities and inputs as seen, row by row."""
     normalise, limit, masked = len(mean) > 0, f(clip), masks.shape[0] > 0
     for begin in range(0, len(raw), BLOCK):
-        n = min(BLOCK, len(raw) - begin)
+        n = BLOCK if len(raw) - begin > BLOCK else len(raw) - begin
         for i in range(n):
             for d in range(places[h.FEATURES]):
                 x = raw[begin + i, d]
@@ -32,7 +32,7 @@ def act(
             if masked:
                 for k in range(places[h.WIDTH]):
                     work[places[h.PENALTY] + k * n + i] = ZERO if masks[begin + i, k] else f(-np.inf)
-        forward(flat, layers, 0, places[h.TRUNK_LAST], work, n)
+        forward(flat, layers, plain(0), places[h.TRUNK_LAST], work, n)
         forward(flat, layers, places[h.ACTOR_FIRST], places[h.ACTOR_LAST], work, n)
         h.sample(places, heads, flat, work, noise, begin, n, masked)
         h.evaluate(places, heads, flat, work, n, masked)
@@ -47,11 +47,11 @@ def act(
 def values(places, layers, flat, work, inputs, out):
     """The critic's value of every row of ``inputs``, already normalised."""
     for begin in range(0, len(inputs), BLOCK):
-        n = min(BLOCK, len(inputs) - begin)
+        n = BLOCK if len(inputs) - begin > BLOCK else len(inputs) - begin
         for i in range(n):
             for d in range(places[h.FEATURES]):
                 work[d * n + i] = inputs[begin + i, d]
-        forward(flat, layers, 0, places[h.TRUNK_LAST], work, n)
+        forward(flat, layers, plain(0), places[h.TRUNK_LAST], work, n)
         forward(flat, layers, places[h.CRITIC_FIRST], places[h.CRITIC_LAST], work, n)
         value = row(work, layers[places[h.CRITIC_LAST] - 1, VALUE], n)
         for i in range(n):

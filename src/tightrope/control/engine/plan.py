@@ -63,7 +63,15 @@ def make_plan(policy: Any) -> Plan:
                     table[-1][d.SLOPE] = reserve(table[-1][d.OUTPUTS])
                 continue
             inputs, outputs = module.in_features, module.out_features
-            line = [inputs, outputs, place(module.weight), place(module.bias), d.NONE, reserve(outputs), reserve(outputs)]
+            line = [
+                inputs,
+                outputs,
+                place(module.weight),
+                place(module.bias),
+                d.NONE,
+                reserve(outputs),
+                reserve(outputs),
+            ]
             table.append([*line, -1, feed])
             feed = len(table) - 1
         return first, len(table)

@@ -42,7 +42,12 @@ def _uncovered_policy(policy: Any) -> str | None:
         reason = _uncovered_network(getattr(policy, name), ends_linear=name != "trunk")
         if reason is not None:
             return f"{reason} in the {name}"
-    known = sum(1 for part in (policy.trunk, policy.actor, policy.critic) if part is not None for _ in part.parameters())
+    known = sum(
+        1
+        for part in (policy.trunk, policy.actor, policy.critic)
+        if part is not None
+        for _ in part.parameters()
+    )
     if known + (policy.log_std is not None) != sum(1 for _ in policy.parameters()):
         return "parameters beside trunk, actor, critic and log_std"
     if not all(p.requires_grad and p.dtype == torch.float32 for p in policy.parameters()):

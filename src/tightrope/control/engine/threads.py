@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tightrope.control.engine.compiled import give_way, kernel, load_shared, pause, store_shared
+from tightrope.control.engine.compiled import give_way, glue, kernel, load_shared, pause, store_shared
 
 # entries of ``control`` (int64), each on a cache line of its own; role 0 is the actor's thread, role 1 the critic's
 ARRIVED, LEFT, EPOCH = 0, 32, 48
@@ -22,7 +22,7 @@ CONTROL_SIZE = 64
 SPINS = 300
 
 
-@kernel
+@glue
 def wait(control, index, count):
     """Wait until ``control[index]`` has reached ``count``; False when the other thread has left for good."""
     spins = 0
@@ -37,7 +37,7 @@ def wait(control, index, count):
     return True
 
 
-@kernel
+@glue
 def meet(control, role):
     """Arrive, and wait for the other; False when the other has left."""
     count = load_shared(control, ARRIVED + LINE * role) + 1
@@ -58,7 +58,9 @@ class Helper:
         """Have ``job`` run beside the caller; False when no thread can be had. ``control[LEFT]`` tells its end."""
         if self._thread is None or self._process != os.getpid() or not self._thread.is_alive():
             self._jobs, self._process = queue.SimpleQueue(), os.getpid()
-            thread = threading.Thread(target=_serve, args=(self, self._jobs), name="tightrope-critic", daemon=True)
+            thread = threading.Thread(
+                target=_serve, args=(self, self._jobs), name="tightrope-critic", daemon=True
+            )
             try:
                 thread.start()
             except RuntimeError:  # the system grants no more threads

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from tightrope.control.engine import heads as h
-from tightrope.control.engine.compiled import entry, kernel, row, store_shared
-from tightrope.control.engine.dense import BLOCK, DELTA, ONE, VALUE, ZERO, backward, exp, f, forward
+from tightrope.control.engine.compiled import entry, glue, kernel, plain, row, store_shared
+from tightrope.control.engine.dense import BLOCK, DELTA, ONE, VALUE, ZERO, backward, exp, f, finite, forward
 from tightrope.control.engine.threads import ARRIVED, EPOCH, LINE, meet, wait
 
 ACTOR, CRITIC, BOTH = 1, 2, 3
@@ -26,7 +26,9 @@ RATE, CRITIC_RATE, BETA_1, BETA_2, EPSILON, RATIO_LIMIT, STEPS_BEFORE, MINIBATCH
 OPTIONS = 20
 
 # entries of a role's ledger (float64): sums of the update so far, and of the present minibatch
-ROWS_SEEN, POLICY, VALUES, ENTROPY, KL, HIGH, LOW, NORMS, NORM_COUNT, SMALLEST, LARGEST, FIRST, STEPS = range(13)
+ROWS_SEEN, POLICY, VALUES, ENTROPY, KL, HIGH, LOW, NORMS, NORM_COUNT, SMALLEST, LARGEST, FIRST, STEPS = range(
+    13
+)
 KL_NOW, BAD_NOW, AT = 13, 14, 15
 LEDGER = 16
 
@@ -72,7 +74,7 @@ def moments(advantages, order, begin, end):
     mean /= count
     variance = 0.0
     for i in range(begin, end):
-        variance += (np.float64(advantages[order[i]]) - mean) ** 2
+        variance += (np.float64(advantages[order[i]]) - mean) * (np.float64(advantages[order[i]]) - mean)
     return mean, 1.0 / (math.sqrt(variance / count) + 1e-8)
 
 
@@ -107,26 +109,31 @@ def surrogate(places, work, n, count, options, ledger):
     ledger[ENTROPY] += disorder
     smallest, largest = ratio[0], ratio[0]
     for i in range(n):
-        smallest, largest = min(smallest, ratio[i]), max(largest, ratio[i])
-    ledger[SMALLEST], ledger[LARGEST] = min(ledger[SMALLEST], smallest), max(ledger[LARGEST], largest)
+        smallest = ratio[i] if ratio[i] < smallest else smallest
+        largest = ratio[i] if ratio[i] > largest else largest
+    ledger[SMALLEST] = smallest if smallest < ledger[SMALLEST] else ledger[SMALLEST]
+    ledger[LARGEST] = largest if largest > ledger[LARGEST] else ledger[LARGEST]
     if ledger[NORM_COUNT] == 0:
         for i in range(n):
-            ledger[FIRST] = max(ledger[FIRST], abs(logp[i] - old[i]))
-    if not np.isfinite(loss + kl + disorder):
+            x = abs(logp[i] - old[i])
+            ledger[FIRST] = x if x > ledger[FIRST] else ledger[FIRST]
+    if not (finite(loss) and finite(kl) and finite(disorder)):
         ledger[BAD_NOW] = 1
 
 
 @kernel
 def not_finite(vector):
-    """Whether a vector holds a NaN or an infinity (0 * x is 0 only for finite x)."""
-    total = ZERO
+    """Whether a vector holds a NaN or an infinity."""
+    bad = np.int32(0)
     for i in range(len(vector)):
-        total += vector[i] * ZERO
-    return not np.isfinite(total)
+        bad += np.int32(0) if finite(vector[i]) else np.int32(1)
+    return bad != 0
 
 
-@kernel
-def actor_block(places, layers, heads, flat, grad, work, data, order, begin, n, count, more, scale, options, ledger):
+@glue
+def actor_block(
+    places, layers, heads, flat, grad, work, data, order, begin, n, count, more, scale, options, ledger
+):
     """The actor's half of a block: its sums into the ledger, its gradients into ``grad``."""
     _, masks, actions, old_logp, _, advantages, _ = data
     masked = masks.shape[0] > 0
@@ -146,10 +153,10 @@ def actor_block(places, layers, heads, flat, grad, work, data, order, begin, n, 
     h.evaluate(places, heads, flat, work, n, masked)
     surrogate(places, work, n, count, options, ledger)
     h.gradient(places, heads, flat, grad, work, n, f(options[ENTROPY_WEIGHT] / count))
-    backward(flat, grad, layers, places[h.ACTOR_FIRST], places[h.ACTOR_LAST], work, n, more, False)
+    backward(flat, grad, layers, places[h.ACTOR_FIRST], places[h.ACTOR_LAST], work, n, more, plain(False))
 
 
-@kernel
+@glue
 def critic_block(places, layers, flat, grad, work, data, order, begin, n, count, more, join, options, ledger):
     """The critic's half of a block: 0.5 (V - R)^2, or with value_clip the larger of that and the clipped one's."""
     _, _, _, _, old_values, _, returns = data
@@ -177,12 +184,12 @@ def critic_block(places, layers, flat, grad, work, data, order, begin, n, count,
             loss += f(0.5) * error * error
             delta[i] = weight * error
     ledger[VALUES] += loss
-    if not np.isfinite(loss) or not_finite(value):
+    if not finite(loss) or not_finite(value):
         ledger[BAD_NOW] = 1
     backward(flat, grad, layers, places[h.CRITIC_FIRST], places[h.CRITIC_LAST], work, n, more, join)
 
 
-@kernel
+@glue
 def gradients(role, places, layers, heads, flat, grad, work, data, order, begin, end, options, ledgers):
     """The gradients of a minibatch, rows begin .. end - 1 of the order, block by block."""
     count, trunk, scale = end - begin, places[h.TRUNK_LAST], (0.0, 1.0)
@@ -195,26 +202,29 @@ def gradients(role, places, layers, heads, flat, grad, work, data, order, begin,
     if role & CRITIC:
         ledgers[1, BAD_NOW] = 0
     for at in range(begin, end, BLOCK):
-        n, more = min(BLOCK, end - at), at > begin
+        n, more = BLOCK if end - at > BLOCK else end - at, at > begin
         gather_inputs(places, work, data[0], order, at, n)
-        forward(flat, layers, 0, trunk, work, n)
+        forward(flat, layers, plain(0), trunk, work, n)
         if role & ACTOR:
             mine = ledgers[0]
-            actor_block(places, layers, heads, flat, grad, work, data, order, at, n, count, more, scale, options, mine)
+            actor_block(
+                places, layers, heads, flat, grad, work, data, order, at, n, count, more, scale, options, mine
+            )
         if role & CRITIC:
             mine = ledgers[1]
-            critic_block(places, layers, flat, grad, work, data, order, at, n, count, more, trunk > 0, options, mine)
-        backward(flat, grad, layers, 0, trunk, work, n, more, False)
+            critic_block(
+                places, layers, flat, grad, work, data, order, at, n, count, more, trunk > 0, options, mine
+            )
+        backward(flat, grad, layers, plain(0), trunk, work, n, more, plain(False))
 
 
 @kernel
 def squares(flat, grad, begin, end):
     """Sum of squares of a half's gradients; NaN also when one of its weights is not finite."""
-    g, p, total, poison = row(grad, begin, end - begin), row(flat, begin, end - begin), ZERO, ZERO
+    g, total = row(grad, begin, end - begin), ZERO
     for i in range(end - begin):
         total += g[i] * g[i]
-        poison += p[i] * ZERO
-    return np.float64(total + poison)
+    return np.float64(f(np.nan) if not_finite(row(flat, begin, end - begin)) else total)
 
 
 @kernel
@@ -223,7 +233,13 @@ def adam(flat, grad, mean, square, begin, end, scale, rate, step, options):
     beta_1, beta_2, n = f(options[BETA_1]), f(options[BETA_2]), end - begin
     size = f(rate / (1 - options[BETA_1] ** step))
     root, epsilon = f(1 / math.sqrt(1 - options[BETA_2] ** step)), f(options[EPSILON])
-    g, p, m, v, scale = row(grad, begin, n), row(flat, begin, n), row(mean, begin, n), row(square, begin, n), f(scale)
+    g, p, m, v, scale = (
+        row(grad, begin, n),
+        row(flat, begin, n),
+        row(mean, begin, n),
+        row(square, begin, n),
+        f(scale),
+    )
     for i in range(n):
         x = g[i] * scale
         first = m[i] + (ONE - beta_1) * (x - m[i])
@@ -233,15 +249,17 @@ def adam(flat, grad, mean, square, begin, end, scale, rate, step, options):
         p[i] -= size * first / (np.sqrt(second) * root + epsilon)
 
 
-@kernel
+@glue
 def settle(role, exchange, flat, grad, moment, square, options, ledgers):
     """Both halves are known: decide as the other thread does, book the norm, and step unless told to stop."""
     total = exchange[SQUARES] + exchange[LEDGER + SQUARES]
     norm = math.sqrt(total)
-    status = max(int(exchange[HALT]), int(exchange[LEDGER + HALT]))
-    if not np.isfinite(total):
+    halt = exchange[HALT] if exchange[HALT] > exchange[LEDGER + HALT] else exchange[LEDGER + HALT]
+    status = int(halt)
+    if not finite(f(total)):
         status = NOT_FINITE
-    scale = min(1.0, options[MAX_NORM] / (norm + 1e-6))
+    scale = options[MAX_NORM] / (norm + 1e-6)
+    scale = scale if scale < 1.0 else 1.0
     for k in range(2):
         if not role & (k + 1):
             continue
@@ -259,7 +277,7 @@ def settle(role, exchange, flat, grad, moment, square, options, ledgers):
     return status
 
 
-@kernel
+@glue
 def publish(role, exchange, flat, grad, options, ledgers, count):
     """What this thread's half, or both halves, contribute to the decision."""
     for k in range(2):
@@ -296,19 +314,24 @@ def train(
     data = (inputs, masks, actions, old_logp, old_values, advantages, returns)
     rows, size = len(order), int(options[MINIBATCH])
     for now in range(epoch, epochs):
-        if role == CRITIC and not wait(control, EPOCH, now + 1):
+        if role == CRITIC and not wait(control, plain(EPOCH), now + 1):
             return ALONE
         if role == ACTOR:
             store_shared(control, EPOCH, now + 1)
         for start in range(begin, rows, size):
-            end = min(start + size, rows)
-            parity = control[ARRIVED + LINE * (role == CRITIC)] & 1  # the other may still be reading the last one
+            end = start + size if start + size < rows else rows
+            parity = (
+                control[ARRIVED + LINE * (role == CRITIC)] & 1
+            )  # the other may still be reading the last one
             own = row(exchange, parity * 2 * LEDGER, 2 * LEDGER)
             for k in range(2):
                 if role & (k + 1):
                     ledgers[k, AT] = start
-                    ledgers[2 + k] = ledgers[k]
-            gradients(role, places, layers, heads, flat, grad, work, data, order, start, end, options, ledgers)
+                    for j in range(LEDGER):
+                        ledgers[2 + k, j] = ledgers[k, j]
+            gradients(
+                role, places, layers, heads, flat, grad, work, data, order, start, end, options, ledgers
+            )
             publish(role, own, flat, grad, options, ledgers, end - start)
             if role != BOTH and not meet(control, role - 1):
                 return ALONE

@@ -1,0 +1,85 @@
+"""The peers' side of speed.py: one training run of stable-baselines3 or sbx, in the peers' own interpreter.
+
+    python speed_peers.py stable-baselines3 '{"env": "CartPole-v1", "num_envs": 8, ...}' RESULT.json
+
+This file imports nothing of tightrope. It writes steps, optimiser steps (as the optimiser itself counted them) and
+versions; the wall time is taken from outside. ``python speed_peers.py versions RESULT.json`` writes what is installed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+PACKAGES = {  # name -> module, distributions whose versions matter
+    "stable-baselines3": ("stable_baselines3", ("stable-baselines3", "torch", "gymnasium", "numpy")),
+    "sbx": ("sbx", ("sbx-rl", "jax", "stable-baselines3", "gymnasium")),
+}
+
+
+def installed() -> dict[str, dict[str, str]]:
+    """The peers this interpreter can import, with versions."""
+    return {
+        peer: {name: importlib.metadata.version(name) for name in names}
+        for peer, (module, names) in PACKAGES.items()
+        if importlib.util.find_spec(module) is not None
+    }
+
+
+def train(peer: str, scenario: dict[str, Any], total_steps: int) -> dict[str, Any]:
+    """Train with the scenario's settings; metrics of every update go to a file, as ours do."""
+    import torch
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.logger import configure
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+    torch.set_num_threads(1)  # its best for networks this small
+    algorithm = importlib.import_module(PACKAGES[peer][0]).PPO
+    vector = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}[scenario["peer_vec"]]
+    env = make_vec_env(scenario["env"], n_envs=scenario["num_envs"], seed=scenario["seed"], vec_env_cls=vector)
+    model = algorithm(
+        "MlpPolicy",
+        env,
+        n_steps=scenario["num_steps"],
+        batch_size=scenario["minibatch_size"],
+        n_epochs=scenario["num_epochs"],
+        learning_rate=scenario["learning_rate"],
+        gamma=scenario["gamma"],
+        gae_lambda=scenario["gae_lambda"],
+        clip_range=0.2,
+        ent_coef=scenario["entropy_weight"],
+        vf_coef=0.5,
+        max_grad_norm=0.5,
+        target_kl=None,
+        seed=scenario["seed"],
+        device="cpu",
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        model.set_logger(configure(folder, ["json"]))
+        model.learn(total_steps)
+    env.close()
+    if peer == "sbx":
+        count = int(model.policy.actor_state.step)
+    else:
+        count = int(next(iter(model.policy.optimizer.state.values()))["step"])
+    return {"steps": model.num_timesteps, "optimiser_steps": count}
+
+
+def main(words: list[str]) -> None:
+    """Run what the command line says and write the result file."""
+    if words[0] == "versions":
+        result: Any = installed()
+    else:
+        scenario = json.loads(words[1])
+        result = train(words[0], scenario, scenario["total_steps"])
+    Path(words[-1]).write_text(json.dumps(result), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

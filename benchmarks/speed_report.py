@@ -1,0 +1,214 @@
+"""What the speed benchmark computes from its raw measurements, and how it writes it down. Pure functions."""
+
+from __future__ import annotations
+
+import math
+import re
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+MATRIX = 64  # the floor's unit of work: single-precision products of MATRIX x MATRIX x MATRIX
+PARTS = ("env", "act", "advantages", "update", "rest")
+# Figures of others that this benchmark does not run itself: measured earlier, on the same kind of machine.
+PUBLISHED = {
+    "cartpole-small": "59,000",
+    "cartpole-zoo": "31,000-41,000",
+    "cartpole-large": "129,000",
+}
+PUBLISHED_SOURCE = (
+    "PureJaxRL's published ppo.py (jax 0.10.2, gymnax 0.0.8, environment compiled too, 2 threads, no entropy term): "
+    "total steps / time of the compiled call, measured earlier on two cores of an AMD EPYC (Zen 4), not in this run"
+)
+
+
+def rate(short: dict[str, Any], long: dict[str, Any]) -> float:
+    """Steps/s by difference: (steps2 - steps1) / (wall2 - wall1) of a short and a long process.
+
+    Both processes pay the same start-up and the same end, so that the difference holds training alone.
+    ValueError when the long run took no longer than the short one: then noise is all there is.
+    """
+    steps, wall = long["steps"] - short["steps"], long["wall"] - short["wall"]
+    if steps <= 0 or wall <= 0:
+        raise ValueError(
+            f"the long run took {wall:.3f} s and {steps} steps more than the short one; expected both to be positive. "
+            "Run fewer programs beside the benchmark, or more steps."
+        )
+    return steps / wall
+
+
+def ratio(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, float]:
+    """Median, smallest and largest of the ratios of paired rates (not the ratio of two medians)."""
+    ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
+    return {"median": statistics.median(ratios), "low": min(ratios), "high": max(ratios)}
+
+
+def optimiser_steps(rollouts: int, rows: int, num_epochs: int, minibatch_size: int) -> int:
+    """Optimiser steps of ``rollouts`` rollouts of ``rows`` transitions each."""
+    return rollouts * num_epochs * math.ceil(rows / minibatch_size)
+
+
+def check_work(scenario: dict[str, Any], run: dict[str, Any], contender: str) -> None:
+    """ValueError unless a run took the optimiser steps that its transitions call for.
+
+    Where every row of a rollout is a transition the number must be exact. NEXT_STEP vector environments spend a
+    row on each reset; tightrope does not count such rows as steps, fills its budget with further (also
+    shorter) rollouts, and so takes a few per cent *more* optimiser steps for the same transitions: never fewer.
+    """
+    rollout = scenario["num_envs"] * scenario["num_steps"]
+    epochs, size = scenario["num_epochs"], scenario["minibatch_size"]
+    fewest = run["steps"] * epochs / size
+    exact = optimiser_steps(run["steps"] // rollout, rollout, epochs, size)
+    whole = run["steps"] % rollout == 0
+    seen = run["optimiser_steps"]
+    good = seen == exact if whole else fewest <= seen <= 1.25 * fewest + epochs
+    if not good:
+        raise ValueError(
+            f"{contender} took {seen} optimiser steps for {run['steps']} steps of {scenario['name']}; "
+            f"expected {exact if whole else f'at least {fewest:.0f}'}. Its settings are not those of the scenario."
+        )
+
+
+def update_flops(networks: Sequence[Sequence[int]], rows: int) -> int:
+    """Floating-point operations of the matrix products of one minibatch update.
+
+    ``networks``: layer sizes, e.g. (4, 64, 64, 2). A product [m, k] x [k, n] counts 2 m k n. Each layer has one
+    forward, one for the gradient of its weight and, but for the first layer, one for that of its input.
+    """
+    total = 0
+    for sizes in networks:
+        layers = [a * b for a, b in zip(sizes, sizes[1:], strict=False)]
+        total += 2 * rows * (3 * sum(layers) - layers[0])
+    return total
+
+
+def floor_microseconds(flops: float, gflops: float) -> float:
+    """The time of these operations on one core at the measured rate of the products, in microseconds."""
+    return flops / (gflops * 1e3)
+
+
+def shares(breakdown: dict[str, Any]) -> dict[str, float]:
+    """The parts of a breakdown as fractions of their sum."""
+    total = sum(breakdown[part] for part in PARTS)
+    return {part: breakdown[part] / total for part in PARTS}
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table that also reads well in a terminal: columns aligned, the first to the left."""
+    lines = [list(head), *(list(row) for row in rows)]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
+
+    def text(line: Sequence[str]) -> str:
+        cells = [c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True))]
+        return "| " + " | ".join(cells) + " |"
+
+    rule = ["-" * widths[0], *("-" * (w - 1) + ":" for w in widths[1:])]
+    return "\n".join([text(lines[0]), "| " + " | ".join(rule) + " |", *(text(line) for line in lines[1:])])
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:,.0f}"
+
+
+def _ratio_text(found: dict[str, float] | None) -> str:
+    if found is None:
+        return "-"
+    return f"{found['median']:.1f} ({found['low']:.1f}-{found['high']:.1f})"
+
+
+def _settings_text(s: dict[str, Any]) -> str:
+    return f"{s['num_envs']} x {s['num_steps']}, {s['minibatch_size']}, {s['num_epochs']}"
+
+
+def speed_table(results: dict[str, Any]) -> str:
+    """Median steps/s of everybody, and our ratio to each peer: median over the pairs (smallest-largest)."""
+    peers = list(results["peers"])
+    head = ["scenario", "environment", "envs x steps, minibatch, epochs", "tightrope", *peers, "PureJaxRL (published)"]
+    rows = []
+    for s in results["scenarios"]:
+        row = [s["name"], s["env"], _settings_text(s), _number(s["rates"]["tightrope"])]
+        row += [_number(s["rates"].get(peer)) for peer in peers]
+        rows.append([*row, PUBLISHED.get(s["name"], "-"), *(_ratio_text(s["ratios"].get(p)) for p in peers)])
+    return table([*head, *(f"ratio to {peer}" for peer in peers)], rows)
+
+
+def breakdown_table(results: dict[str, Any]) -> str:
+    """Where our time goes, per step of all environments, and what a minibatch update costs beside its floor."""
+    head = ["scenario", "environments", *(f"{part} us" for part in PARTS), "us a minibatch", "floor us", "of the floor"]
+    rows = []
+    for s in results["scenarios"]:
+        b = s["breakdown"]
+        parts = [f"{b[part]:.1f} ({100 * share:.0f} %)" for part, share in shares(b).items()]
+        floor = floor_microseconds(b["flops"], results["sgemm_gflops"])
+        minibatch = b["minibatch_microseconds"]
+        rows.append([s["name"], b["backend"], *parts, f"{minibatch:.1f}", f"{floor:.1f}", f"{100 * floor / minibatch:.0f} %"])
+    return table(head, rows)
+
+
+def memory_table(results: dict[str, Any]) -> str:
+    """Peak memory of each contender in MB, warm cache."""
+    names = ["tightrope", *results["peers"]]
+    rows = [[s["name"], *(_number(s["memory_mb"].get(name)) for name in names)] for s in results["scenarios"]]
+    return table(["scenario", *(f"{name} MB" for name in names)], rows)
+
+
+def speed_text(results: dict[str, Any]) -> str:
+    """The results as a Markdown text: the terminal's output and the page's block."""
+    machine, start = results["machine"], results["start_up"]
+    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    peers = "; ".join(
+        f"{peer} ({', '.join(f'{name} {version}' for name, version in found.items())})"
+        for peer, found in results["peers"].items()
+    )
+    pairs = min((len(s["pairs"]) for s in results["scenarios"]), default=0)
+    return "\n".join(
+        [
+            f"Measured {results['date']} on {machine['cpu']}, {machine['cores']} cores, {machine['system']}, with",
+            f"`{results['command']}`: {pairs} pairs a scenario.",
+            f"tightrope with {versions}. Peers: {peers or 'none found'}.",
+            "",
+            "Steps/s of the whole training loop, medians; ratios are medians over the pairs (smallest-largest):",
+            "",
+            speed_table(results),
+            "",
+            f"Last column but the ratios: {PUBLISHED_SOURCE}.",
+            "",
+            "Where our time goes, in microseconds per step of all environments of a scenario, and one minibatch update",
+            f"beside its floor (the matrix products alone, on one core at the {results['sgemm_gflops']:.0f} GFLOP/s",
+            f"measured for {MATRIX}x{MATRIX}x{MATRIX}; actor and critic may use a core each, so that 100 % is no limit):",
+            "",
+            breakdown_table(results),
+            "",
+            "Peak memory of whole processes, workers included:",
+            "",
+            memory_table(results),
+            "",
+            f"First run with an empty cache: {start['cold_seconds']:.1f} s from start to end of a short run, peak",
+            f"{start['cold_memory_mb']:,.0f} MB; the same run once cached: {start['warm_seconds']:.1f} s, peak",
+            f"{start['warm_memory_mb']:,.0f} MB. Compilation is the difference:",
+            f"{start['cold_seconds'] - start['warm_seconds']:.1f} s, once per version and machine.",
+        ]
+    )
+
+
+def scaling_text(results: dict[str, Any]) -> str:
+    """The scaling results as a Markdown text."""
+    rows = [
+        [name, " ".join(f"{x:g}" for x, _ in series["points"]), f"{series['spread']:.2f}", f"{series['exponent']:.2f}"]
+        for name, series in results["series"].items()
+    ]
+    lines = [f"Measured {results['date']} with `{results['command']}`.", ""]
+    lines.append(table(["cost against", "measured at", "fit: 1 - R^2", "exponent"], rows))
+    for name, series in results["series"].items():
+        a, b = series["intercept"], series["slope"]
+        points = ", ".join(f"{x:g}: {y:.4g}" for x, y in series["points"])
+        lines += ["", f"- {name} ({series['unit']}): {points}; fit {a:.3g} + {b:.3g} x"]
+    return "\n".join(lines)
+
+
+def fill(page: str, name: str, body: str) -> str:
+    """The page with the block between ``<!-- name -->`` and ``<!-- /name -->`` replaced. ValueError: no such block."""
+    pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+    if len(pattern.findall(page)) != 1:
+        raise ValueError(f"the page has no single block <!-- {name} --> ... <!-- /{name} -->; put one where it belongs.")
+    return pattern.sub(lambda match: f"{match[1]}\n{body}\n\n{match[2]}", page)

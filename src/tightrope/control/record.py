@@ -1,0 +1,135 @@
+"""A video of the policy at work: rendered off screen, written as mp4."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from tightrope.control import tasks
+from tightrope.control.evaluate import EVALUATION_SEED
+
+MAX_FRAMES = 10_000
+DEFAULT_FPS = 30
+
+
+def record_run(
+    path: str | Path,
+    *,
+    out: str | Path | None = None,
+    best: bool = False,
+    episodes: int = 1,
+    seed: int | None = None,
+    env: Any = None,
+    policy: Any = None,
+) -> dict[str, Any]:
+    """Record ``episodes`` deterministic episodes of a run or saved folder; gives path, frames, returns.
+
+    ``out`` None: ``RUN/videos/step-<step>.mp4``. Raises ValueError naming the package or the system library
+    that is missing, or when the environment cannot render.
+    """
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ValueError("Writing mp4 needs imageio-ffmpeg. Install it: pip install 'tightrope[video]'.")
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame without a display
+        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo without one; read when it is first imported
+    from tightrope.control.saving import load
+
+    agent = load(path, env=env, policy=policy, best=best)
+    try:
+        task = _renderable(agent.env, agent.settings.env)
+        target = Path(out) if out is not None else Path(path) / "videos" / f"step-{agent.steps:012d}.mp4"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        returns, frames = _play(agent, task, target, episodes, EVALUATION_SEED if seed is None else seed)
+    finally:
+        agent.close()
+    return {"path": str(target), "frames": frames, "returns": returns, "step": agent.steps}
+
+
+def _renderable(env: Any, name: str) -> gym.Env:
+    """A fresh environment that renders to arrays."""
+    if isinstance(env, str):
+        try:
+            return tasks.make_by_id(env, render_mode="rgb_array")
+        except (gym.error.Error, TypeError, ImportError) as error:
+            raise _cannot(name, error) from error
+    task = env() if callable(env) and not isinstance(env, gym.Env) else env
+    if isinstance(task, gym.vector.VectorEnv) or getattr(task, "render_mode", None) != "rgb_array":
+        raise ValueError(
+            f"{name} has render_mode {getattr(task, 'render_mode', None)!r}; recording needs a single "
+            "environment made with render_mode='rgb_array'."
+        )
+    return task
+
+
+def _cannot(name: str, error: Exception) -> ValueError:
+    text = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+    low = str(error).lower()
+    if "pygame" in low:
+        advice = "Install pygame: pip install 'tightrope[video]'."
+    elif any(word in low for word in ("egl", "opengl", "osmesa", "glfw", "gladload", "libgl")):
+        advice = (
+            "The system library libEGL is missing or cannot be used. Install it (Debian, Ubuntu: apt install "
+            "libegl1 libgl1), or OSMesa (apt install libosmesa6) and set MUJOCO_GL=osmesa."
+        )
+    else:
+        advice = "Does the environment support render_mode='rgb_array'?"
+    return ValueError(f"{name} cannot be rendered ({text}). {advice}")
+
+
+def _play(agent: Any, task: gym.Env, target: Path, episodes: int, seed: int) -> tuple[list[float], int]:
+    """Play and write; the file appears only when it is complete."""
+    import imageio_ffmpeg
+
+    fps = int(task.metadata.get("render_fps") or DEFAULT_FPS)
+    temporary = target.with_name(f".{target.name}.part.mp4")
+    writer, returns, frames = None, [], 0
+    try:
+        for episode in range(episodes):
+            observation, info = task.reset(seed=seed + episode)
+            total, over = 0.0, False
+            while not over and frames < MAX_FRAMES:
+                frame = _frame(task, agent.settings.env)
+                if writer is None:
+                    size = (frame.shape[1], frame.shape[0])
+                    writer = imageio_ffmpeg.write_frames(str(temporary), size, fps=fps, macro_block_size=2)
+                    writer.send(None)
+                writer.send(np.ascontiguousarray(frame))
+                frames += 1
+                action, _ = agent.predict(observation, action_masks=_mask(task, info))
+                observation, reward, terminated, truncated, info = task.step(action)
+                total, over = total + float(reward), bool(terminated or truncated)
+            returns.append(total)
+    finally:
+        if writer is not None:
+            writer.close()
+        task.close()
+    temporary.replace(target)
+    return returns, frames
+
+
+def _frame(task: gym.Env, name: str) -> np.ndarray:
+    try:
+        frame = task.render()
+    except Exception as error:  # renderers fail in as many ways as there are drivers
+        raise _cannot(name, error) from error
+    if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3:
+        raise ValueError(
+            f"{name} rendered {type(frame).__name__}; expected an RGB array of shape (height, width, 3)."
+        )
+    return frame.astype(np.uint8, copy=False)
+
+
+def _mask(task: gym.Env, info: dict[str, Any]) -> Any:
+    """The action mask of the present state, from the info or the environment's own method; None without
+    any.
+    """
+    if "action_mask" in info:
+        return info["action_mask"]
+    own = getattr(task.unwrapped, "action_masks", None)
+    return own() if callable(own) else None

@@ -1,0 +1,53 @@
+"""Each option says what it does, what its default is, and its range where it has one."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from tightrope import options
+from tightrope.algorithms.settings import range_text
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+from tightrope.flags import Parser, settings_fields
+
+PARSERS = {
+    **{f"train --algorithm {name}": options.train_parser(name) for name in ALGORITHM_SETTINGS},
+    "evaluate": options.evaluate_parser(),
+    "record": options.record_parser(),
+    "resume": options.resume_parser(),
+}
+OPTIONS = [
+    pytest.param(action, id=f"{command} {action.option_strings[0]}")
+    for command, parser in PARSERS.items()
+    for action in parser._actions
+    if action.option_strings and not isinstance(action, argparse._HelpAction)
+]
+
+
+@pytest.mark.parametrize("action", OPTIONS)
+def test_every_option_states_its_default(action: argparse.Action):
+    """A switch that is off unless given needs no word; everything that takes a value does."""
+    text = action.help or ""
+    assert len(text) > 10, "no help"
+    if action.nargs != 0 or isinstance(action, argparse.BooleanOptionalAction):
+        assert "default" in text, text
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHM_SETTINGS)
+def test_every_setting_is_an_option_with_its_range(algorithm: str):
+    parser: Parser = PARSERS[f"train --algorithm {algorithm}"]
+    shown = {action.dest: action.help or "" for action in parser._actions}
+    for kind in (TrainSettings, ALGORITHM_SETTINGS[algorithm]):
+        for name, field in settings_fields(kind).items():
+            assert name in shown, f"{name} is no option"
+            assert field.metadata["doc"].replace("%", "%%") in shown[name]
+            assert range_text(field.metadata) in shown[name]
+
+
+@pytest.mark.parametrize("command", PARSERS)
+def test_help_can_be_printed(command: str):
+    """A stray percent sign in a help text would end --help with an error."""
+    text = PARSERS[command].format_help()
+    assert "usage: tightrope" in text
+    assert max(map(len, text.splitlines())) <= 110

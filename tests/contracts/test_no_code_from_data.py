@@ -1,0 +1,139 @@
+"""Nothing read is ever run: no unpickling, no evaluation of text, no module named by a file."""
+
+from __future__ import annotations
+
+import ast
+
+import pytest
+from source_tree import SRC, imports, module_of, name_of, sources
+
+UNPICKLERS = {
+    "pickle",
+    "cPickle",
+    "_pickle",
+    "cloudpickle",
+    "dill",
+    "joblib",
+    "shelve",
+    "marshal",
+    "jsonpickle",
+}
+RUNNERS = {"eval", "exec", "compile", "__import__"}
+LOADERS = {
+    ("torch", "load"),
+    ("hub", "load"),
+    ("yaml", "load"),
+    ("yaml", "unsafe_load"),
+    ("yaml", "full_load"),
+    ("runpy", "run_path"),
+    ("runpy", "run_module"),
+}
+KEYWORDS = {"allow_pickle", "trust_remote_code"}
+
+# Where something of the kind is allowed, and why. Nothing else is, and an entry that is not needed fails.
+TRANSPORT = "multiprocessing hands the user's own live factory to a worker when it starts"
+CACHE = "numba's compile cache, in the user's cache directory, 0700, can be switched off"
+NAMED_BY_THE_USER = "--env-module: code named on the command line"
+OWN_NAMES = "imports the package's own modules, whose names stand in its source"
+EXCEPTIONS = {
+    ("control/workers.py", "CloudpickleWrapper"): TRANSPORT,
+    ("control/workers.py", "multiprocessing"): TRANSPORT,
+    ("control/engine/compiled.py", "cache="): CACHE,
+    ("cli.py", "import_module"): NAMED_BY_THE_USER,
+    ("cli.py", "exec_module"): NAMED_BY_THE_USER,
+    ("cli.py", "spec_from_file_location"): NAMED_BY_THE_USER,
+    ("__init__.py", "import_module"): OWN_NAMES,
+}
+
+
+def findings(module: ast.Module, name: str = "tightrope.x") -> set[tuple[int, str]]:
+    """Line and word of every place where data could become code."""
+    found = set()
+    for line, full in imports(module, name):
+        parts = full.split(".")
+        found |= {(line, part) for part in parts[:1] if part in UNPICKLERS | {"multiprocessing"}}
+        if parts[-1] == "CloudpickleWrapper":
+            found.add((line, "CloudpickleWrapper"))
+        if tuple(parts) in LOADERS or full == "torch.hub.load":
+            found.add((line, ".".join(parts[-2:])))
+        if parts[0] == "importlib" and parts[-1] in ("import_module", "spec_from_file_location"):
+            found.add((line, parts[-1]))
+    for node in ast.walk(module):
+        if isinstance(node, ast.Call):
+            found |= {(node.lineno, word) for word in _called(node)}
+    return found
+
+
+def _called(call: ast.Call) -> list[str]:
+    function, words = call.func, []
+    if isinstance(function, ast.Name):
+        words += [function.id] if function.id in RUNNERS else []
+    elif isinstance(function, ast.Attribute):
+        last = ast.unparse(function.value).rpartition(".")[2]
+        if (last, function.attr) in LOADERS or (last == "builtins" and function.attr in RUNNERS):
+            words.append(f"{last}.{function.attr}")
+        if function.attr in ("import_module", "exec_module", "spec_from_file_location"):
+            words.append(function.attr)
+    for keyword in call.keywords:
+        constant = keyword.value.value if isinstance(keyword.value, ast.Constant) else "something"
+        if keyword.arg in KEYWORDS and constant is not False:
+            words.append(f"{keyword.arg}={constant}")
+        if keyword.arg == "weights_only" and constant is not True:
+            words.append("weights_only")
+        if keyword.arg == "cache" and constant is not False:
+            words.append("cache=")
+    return words
+
+
+def test_data_never_becomes_code():
+    found, used = [], set()
+    for path in sources():
+        for line, word in findings(ast.parse(path.read_text()), module_of(path)):
+            place = (path.relative_to(SRC).as_posix(), word)
+            if place in EXCEPTIONS:
+                used.add(place)
+            else:
+                found.append(f"{name_of(path)}:{line} {word}")
+    assert not found, "\n".join(found)
+    assert used == set(EXCEPTIONS), f"no longer needed: {set(EXCEPTIONS) - used}"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import pickle",
+        "from cloudpickle import loads",
+        "def f():\n    import joblib.numpy_pickle",
+        "from torch import load",
+        "torch.load(path)",
+        "torch.load(path, weights_only=True)",
+        "torch.hub.load(path)",
+        "eval(text)",
+        "exec(text)",
+        "builtins.exec(text)",
+        "__import__(name)",
+        "yaml.load(file)",
+        "numpy.load(path, allow_pickle=True)",
+        "numpy.load(path, allow_pickle=flag)",
+        "AutoModel.from_pretrained(path, trust_remote_code=True)",
+        "importlib.import_module(name)",
+        "from importlib import import_module",
+        "numba.njit(cache=True)(f)",
+        "from multiprocessing import Pipe",
+    ],
+)
+def test_the_lint_sees_it(code: str):
+    assert findings(ast.parse(code))
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "model.eval()",
+        "numpy.load(path, allow_pickle=False)",
+        "re.compile(text)",
+        "from safetensors.torch import load",
+    ],
+)
+def test_the_lint_lets_pass(code: str):
+    assert not findings(ast.parse(code))

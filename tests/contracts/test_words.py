@@ -1,0 +1,51 @@
+"""The repository speaks of itself: nothing in it names a machine that it was made on, or how it was made."""
+
+from __future__ import annotations
+
+import re
+
+from source_tree import ROOT, files, name_of
+
+# put together here, so that this file does not find itself
+FOREIGN = [
+    "/" + r"work/\w",
+    "/" + r"tmp/v\b",
+    "/" + r"root/\w",
+    "/" + r"home/(?!runner)\w",
+    "shared/(?:DES" + "IGN|LES" + "SON|res" + "earch|peers|proto" + "types)",
+    r"\b(?:DES" + "IGN|LES" + "SON|INTER" + r"FACES)\.md",
+    r"\bissues? " + r"[A-D]\b",
+    r"\bthe " + r"lead\b(?! to)",
+    r"\b(?:chat" + "gpt|cla" + r"ude|copi" + r"lot)\b",
+    r"\bas an " + r"ai\b|\blanguage model " + "wrote",
+]
+TEXT = {".py", ".md", ".toml", ".txt", ".cfg", ".ini", ".yml", ".yaml", ".json", ".svg", ".sh", ""}
+
+
+def foreign(text: str) -> list[str]:
+    """What in a text does not belong here."""
+    return [match.group(0) for word in FOREIGN for match in re.finditer(word, text, re.IGNORECASE)]
+
+
+def test_nothing_names_a_workplace():
+    found = []
+    for path in files():
+        if path.suffix in TEXT and path.name != "LICENSE":
+            text = path.read_text(encoding="utf-8", errors="replace")
+            found += [f"{name_of(path)}: {word}" for word in foreign(text)]
+    assert not found, "\n".join(found)
+
+
+def test_the_check_can_fail():
+    assert foreign("see /" + "work/main") and foreign("DES" + "IGN.md says")
+    assert not foreign("work in progress, runs/pole/settings.json")
+
+
+def test_only_text_and_pictures_are_kept():
+    """No archives, weights or notebooks: what cannot be read in a diff does not belong into the repository."""
+    pictures = {".png", ".gif", ".svg", ".jpg", ".webp"}
+    known = TEXT | pictures | {".typed"}
+    kept = [path for path in files() if path.suffix not in known and path.parent != ROOT]
+    assert not [name_of(path) for path in kept]
+    heavy = [name_of(path) for path in files() if path.stat().st_size > 2_000_000]
+    assert not heavy
