@@ -1,9 +1,9 @@
-"""Where tightrope's own time goes: one run with a clock around the environments, the actor, values and update.
+"""Where tightrope's own time goes: one run with clocks around environments, actor, values and update.
 
     python speed_inside.py '{"env": "CartPole-v1", "num_envs": 8, ...}' RESULT.json
 
-The clocks cost about a microsecond a step, so speeds are not taken from here. Also measures the floor's unit: single
--precision products of 64 x 64 x 64 on one core.
+The clocks cost about a microsecond a step, so speeds are not taken from here. Also measures the floor's unit:
+float32 products of 64 x 64 x 64 on one core.
 """
 
 from __future__ import annotations
@@ -16,17 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed_report import MATRIX, PARTS, update_flops
+from speed_report import MATRIX, PARTS, tightrope_settings, update_flops
 
 WARM_ROLLOUTS = 3
-
-
-def settings_of(scenario: dict[str, Any]) -> dict[str, Any]:
-    """The scenario as keyword arguments of tightrope.PPO."""
-    names = ("num_envs", "num_steps", "minibatch_size", "num_epochs", "learning_rate", "gamma", "gae_lambda", "seed")
-    fixed = {"learning_rate_schedule": "constant", "target_kl": None, "max_grad_norm": 0.5, "hidden": (64, 64)}
-    plain = {"normalise_observations": False, "normalise_rewards": False, "entropy_weight": scenario["entropy_weight"]}
-    return {name: scenario[name] for name in names} | fixed | plain
 
 
 def clocked(owner: Any, name: str, label: str, seconds: Counter[str]) -> None:
@@ -49,7 +41,7 @@ def breakdown(scenario: dict[str, Any], rollouts: int) -> dict[str, Any]:
 
     import tightrope
 
-    agent = tightrope.PPO(scenario["env"], **settings_of(scenario))
+    agent = tightrope.PPO(scenario["env"], **tightrope_settings(scenario))
     updates = agent.iterate(10**9)
     for _ in range(WARM_ROLLOUTS):
         next(updates)

@@ -2,8 +2,8 @@
 
     python speed_peers.py stable-baselines3 '{"env": "CartPole-v1", "num_envs": 8, ...}' RESULT.json
 
-This file imports nothing of tightrope. It writes steps, optimiser steps (as the optimiser itself counted them) and
-versions; the wall time is taken from outside. ``python speed_peers.py versions RESULT.json`` writes what is installed.
+This file imports nothing of tightrope. It writes steps and optimiser steps (as the optimiser itself counted
+them); the wall time is taken from outside. ``speed_peers.py versions RESULT.json`` writes what is installed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ def train(peer: str, scenario: dict[str, Any], total_steps: int) -> dict[str, An
     torch.set_num_threads(1)  # its best for networks this small
     algorithm = importlib.import_module(PACKAGES[peer][0]).PPO
     vector = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}[scenario["peer_vec"]]
-    env = make_vec_env(scenario["env"], n_envs=scenario["num_envs"], seed=scenario["seed"], vec_env_cls=vector)
+    env = make_vec_env(
+        scenario["env"], n_envs=scenario["num_envs"], seed=scenario["seed"], vec_env_cls=vector
+    )
     model = algorithm(
         "MlpPolicy",
         env,

@@ -1,7 +1,7 @@
-"""Draw the four cases of the clip with the library's own loss and its own gradient: python docs/images/clip.py
+"""Draw the four cases of the clip with the library's own loss: python docs/images/clip.py
 
-Nothing here knows where the clip begins: the curve is `clipped_surrogate`, and its colour is the gradient that
-torch derives from it.
+Nothing here knows where the clip begins: the curve is `clipped_surrogate`, and its colour is the gradient
+that torch derives from it.
 """
 
 from __future__ import annotations

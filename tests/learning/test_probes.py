@@ -82,11 +82,10 @@ def test_a_time_limit_is_not_death(backend, engine):
 
     Were truncation taken for death, V could not exceed 8.
     """
-    agent = tightrope.PPO(
-        lambda: TimeLimit(Forever(), 8), seed=1, gamma=0.95, vector_backend=backend, num_workers=2, engine=engine,
-        **{**FAST, **PLAIN, "learning_rate": 1e-2, "num_epochs": 10},
-    )  # fmt: skip
-    agent.learn(80_000)
+    values = {**FAST, **PLAIN, "learning_rate": 1e-2, "num_epochs": 10, "gamma": 0.95, "seed": 1}
+    values |= {"vector_backend": backend, "num_workers": 2, "engine": engine}
+    agent = tightrope.PPO(lambda: TimeLimit(Forever(), 8), **values)
+    agent.learn(60_000)
     agent.close()
     assert agent.value(np.zeros(1, np.float32)) == pytest.approx(20.0, rel=0.02)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,35 +46,26 @@ class Batch:
         """The number of rows."""
         return self.mask.shape[0]
 
-    def select(self, rows: Any) -> Batch:
+    def map(self, change: Callable[[Tensor], Tensor]) -> Batch:
+        """The batch with every tensor changed by one function."""
+        inputs = {name: change(leaf) for name, leaf in self.inputs.items()}
+        names = [field.name for field in dataclasses.fields(self) if field.name != "inputs"]
+        return dataclasses.replace(self, inputs=inputs, **{n: change(getattr(self, n)) for n in names})
+
+    def select(self, rows: Tensor | slice) -> Batch:
         """The batch of these rows only (an index tensor or a slice)."""
-        values = {}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            values[field.name] = (
-                {name: leaf[rows] for name, leaf in value.items()} if isinstance(value, dict) else value[rows]
-            )
-        return Batch(**values)
+        return self.map(lambda x: x[rows])
 
     def as_steps(self) -> Batch:
         """[B, T] to [N, 1]: every counting step becomes a row of its own; masked steps are left out."""
-
-        def flat(x: Tensor) -> Tensor:
-            return x.reshape(x.shape[0] * x.shape[1], 1, *x.shape[2:])
-
-        values = {}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            values[field.name] = (
-                {name: flat(leaf) for name, leaf in value.items()} if isinstance(value, dict) else flat(value)
-            )
-        steps = Batch(**values)
+        steps = self.map(lambda x: x.reshape(x.shape[0] * x.shape[1], 1, *x.shape[2:]))
         return steps if bool(steps.mask.all()) else steps.select(steps.mask[:, 0].nonzero()[:, 0])
 
     def cleared(self) -> Batch:
         """The same with 0 in every number outside the mask: padding may hold anything, NaN included."""
         names = ("old_logp", "old_values", "advantages", "returns")
-        return dataclasses.replace(self, **{n: torch.where(self.mask, getattr(self, n), 0.0) for n in names})
+        numbers: dict[str, Any] = {n: torch.where(self.mask, getattr(self, n), 0.0) for n in names}
+        return dataclasses.replace(self, **numbers)
 
     def minibatches(self, size: int, rng: np.random.Generator) -> Iterator[Batch]:
         """All rows once, in a fresh random order, ``size`` at a time; a smaller last one is used as it is."""

@@ -69,7 +69,7 @@ def check_ranges(settings: Any) -> None:
                 )
 
 
-def scheduled(value: T, schedule: Schedule, progress: float) -> T:
+def scheduled(value: float | None, schedule: Schedule, progress: float) -> float | None:
     """The value of a schedule at ``progress`` in [0, 1]; linear and cosine fall from the value to 0.
 
     linear: value * (1 - progress);  cosine: value * (1 + cos(pi * progress)) / 2;  None stays None.
@@ -77,7 +77,7 @@ def scheduled(value: T, schedule: Schedule, progress: float) -> T:
     if value is None or schedule == "constant":
         return value
     factor = 1.0 - progress if schedule == "linear" else 0.5 * (1.0 + math.cos(math.pi * progress))
-    return value * factor  # type: ignore[operator]
+    return value * factor
 
 
 SCHEDULES = get_args(Schedule)

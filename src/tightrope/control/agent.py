@@ -188,10 +188,10 @@ class Agent:
         batched = _is_batched(layout, observation)
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
         rows = len(next(iter(inputs.values())))
-        if action_masks is not None:
-            inputs = {**inputs, "action_mask": actions.flatten_mask(action_masks, rows)}
-        elif layout.has_mask:
-            inputs = {**inputs, "action_mask": actions.flatten_mask(layout.mask_of(observation), rows)}
+        masks = layout.mask_of(observation) if action_masks is None and layout.has_mask else action_masks
+        flat_mask = actions.flatten_mask(masks, rows)
+        if flat_mask is not None:
+            inputs = {**inputs, "action_mask": flat_mask}
         tensors = {
             k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()
         }

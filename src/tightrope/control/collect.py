@@ -129,7 +129,7 @@ class Collector:
                 rollout.truncated[:, t] = step.truncated
                 if step.phantom is not None:
                     np.logical_not(step.phantom, out=rollout.mask[:, t])
-                if step.final_rows is not None:
+                if step.final_rows is not None and step.final_inputs is not None:
                     rollout.finals.append((t, step.final_rows, step.final_inputs))
         except Exception:
             self._check_numbers(

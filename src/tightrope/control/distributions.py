@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -162,8 +163,6 @@ def _expected_log_tanh_slope(mean: Tensor, log_std: Tensor) -> Tensor:
 
 
 def _hermite(device: torch.device) -> tuple[Tensor, Tensor]:
-    import numpy as np
-
     nodes, weights = np.polynomial.hermite_e.hermegauss(16)
-    as_float = {"dtype": torch.float32, "device": device}
-    return torch.as_tensor(nodes, **as_float), torch.as_tensor(weights / weights.sum(), **as_float)
+    pair = torch.as_tensor(np.stack([nodes, weights / weights.sum()]), dtype=torch.float32, device=device)
+    return pair[0], pair[1]

@@ -86,11 +86,10 @@ class TorchEngine:
         gae_lambda: float,
     ) -> Array:
         """maths.returns.gae on arrays."""
-        tensors = [
-            torch.from_numpy(np.ascontiguousarray(x))
-            for x in (rewards, values, next_values, terminated, ended)
-        ]
-        return returns.gae(*tensors, gamma, gae_lambda, torch.from_numpy(mask)).numpy()
+        r, v, following, dead, cut, counts = (
+            torch.from_numpy(x) for x in (rewards, values, next_values, terminated, ended, mask)
+        )
+        return returns.gae(r, v, following, dead, cut, gamma, gae_lambda, counts).numpy()
 
     def update(
         self,
@@ -156,6 +155,7 @@ class CompiledEngine:
         **more: Any,
     ) -> dict[str, float]:
         """ppo.update, compiled."""
+        assert isinstance(settings, PPOSettings)
         return self.fused.update(self.policy, optimiser, batch, settings, rng, **more)
 
     def check(self, batch: Batch, settings: UpdateSettings) -> str:

@@ -1,4 +1,5 @@
-"""The compiled CPU engine: the same PPO update as algorithms/ppo.py, on the very memory of the torch parameters.
+"""The compiled CPU engine: the same PPO update as algorithms/ppo.py, on the very memory of the torch
+parameters.
 
 numba is imported only when the engine is made. ``unsupported`` says beforehand what it does not cover.
 """
@@ -16,7 +17,8 @@ __all__ = ["FusedEngine", "compilation_due", "unsupported"]
 
 
 def compilation_due() -> bool:
-    """Whether making the first engine of this process will compile it (many seconds, once) or read a cache."""
+    """Whether making the first engine of this process will compile it (many seconds, once) or read a
+    cache."""
     from tightrope.control.engine.compiled import compilation_due
 
     return compilation_due()

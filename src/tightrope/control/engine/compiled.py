@@ -1,8 +1,13 @@
-"""How the engine's functions are compiled: flags, cache folder, and the few instructions numba has no words for.
+"""How the engine's functions are compiled: flags, cache folder, and the few instructions numba has no words
+for.
 
-Never ``fastmath=True``: it promises the compiler that no NaN exists and makes every isnan and isfinite false.
+Never ``fastmath=True``: it promises the compiler that no NaN exists and makes every isnan and isfinite
+false. ``reassoc`` alone already turns x - x into 0, and np.isfinite, which numba builds on it, into True:
+in code with these flags ``dense.finite``, which reads the bits, is the only way to ask.
 """
 
+# mypy: ignore-errors
+# (numba's options and modules are not all in its types)
 from __future__ import annotations
 
 import contextlib
@@ -49,7 +54,8 @@ def glue(function: Any) -> Any:
 
 
 def element(function: Any) -> Any:
-    """Compile a function of one number whose rounding steps carry its accuracy: no reordering, fused multiply-add only."""
+    """Compile a function of one number whose rounding steps carry its accuracy: no reordering, fused
+    multiply-add only."""
     _LATE.add(function.__name__)
     return numba.njit(fastmath={"contract"}, forceinline=True, no_cpython_wrapper=True, **OPTIONS)(function)
 
@@ -63,7 +69,8 @@ llvm.add_symbol("tightrope_yield", ctypes.cast(_YIELD, ctypes.c_void_p).value)
 def cache_folder() -> Path | None:
     """Where compiled code is kept, 0700 below the user's cache directory; None when switched off or not safe.
 
-    The name of the last folder stands for everything the machine code depends on: these sources, numba, the CPU.
+    The name of the last folder stands for everything the machine code depends on: these sources, numba, the
+    CPU.
     """
     if os.environ.get(SWITCH, "").lower() in ("off", "0", "no", "none"):
         return None
@@ -89,7 +96,8 @@ def cache_folder() -> Path | None:
 
 
 def compilation_due() -> bool:
-    """Whether loading the engine will compile it (many seconds) and not read it from the cache (under one)."""
+    """Whether loading the engine will compile it (many seconds) and not read it from the cache (under
+    one)."""
     folder = cache_folder()
     return folder is None or not (folder / "complete").exists()
 
@@ -105,14 +113,15 @@ def mark_complete() -> None:
 def _late_optimisation() -> Iterator[None]:
     """Leave glue and element functions as they are until they stand in their callers.
 
-    numba optimises each function, and again all it calls within each caller, which takes most of the compile time.
+    numba optimises each function, and again all it calls within each caller, which takes most of the compile
+    time.
     Where a version of numba has other insides, it goes its own way and only takes longer.
     """
     original = getattr(codegen.CPUCodeLibrary, "_optimize_final_module", None)
 
     def optimise(library: Any) -> None:
         if library.name not in _LATE:
-            original(library)  # type: ignore[misc]
+            original(library)
 
     if original is not None:
         codegen.CPUCodeLibrary._optimize_final_module = optimise
@@ -157,7 +166,8 @@ def plain(typing: Any, constant: Any) -> Any:
 
 @intrinsic
 def row(typing: Any, array: Any, offset: Any, count: Any) -> Any:
-    """``array[offset : offset + count]`` of a contiguous vector, without checks, wraparound or reference counts."""
+    """``array[offset : offset + count]`` of a contiguous vector, without checks, wraparound or reference
+    counts."""
     kind = types.Array(array.dtype, 1, "C")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -173,7 +183,8 @@ def row(typing: Any, array: Any, offset: Any, count: Any) -> Any:
 
 @intrinsic
 def gemm(typing: Any, ta: Any, tb: Any, m: Any, n: Any, k: Any, a: Any, b: Any, beta: Any, c: Any) -> Any:
-    """BLAS sgemm, column-major: C [m, n] = op(A) op(B) + beta C; a, b, c are (vector, offset, leading dimension)."""
+    """BLAS sgemm, column-major: C [m, n] = op(A) op(B) + beta C; a, b, c are (vector, offset, leading
+    dimension)."""
     signature = types.void(
         types.boolean, types.boolean, types.intp, types.intp, types.intp, a, b, types.float32, c
     )

@@ -1,10 +1,14 @@
 """Layers: forward and backward over one flat buffer of parameters, widths and depths known only at run time.
 
-Everything is feature-major, [features, rows], so that rows fill the vector lanes: a layer is Z = W X + b with W as torch
-keeps it, [outputs, inputs]. ``work`` holds all intermediate matrices, each [features, n] for the n rows of a block,
+Everything is feature-major, [features, rows], so that rows fill the vector lanes: a layer is Z = W X + b
+with W as torch
+keeps it, [outputs, inputs]. ``work`` holds all intermediate matrices, each [features, n] for the n rows of a
+block,
 densely packed from its own offset.
 """
 
+# mypy: ignore-errors
+# (what numba makes of these functions is not what mypy sees)
 from __future__ import annotations
 
 import numpy as np
@@ -33,7 +37,8 @@ ZERO, ONE = f(0), f(1)
 
 @element
 def exp(x):
-    """e^x within 2 ulp; inf above 88.72, 0 below -87.3, NaN for NaN (Cephes; 1.5 * 2^23 rounds to an integer)."""
+    """e^x within 2 ulp; inf above 88.72, 0 below -87.3, NaN for NaN (Cephes; 1.5 * 2^23 rounds to an
+    integer)."""
     y = f(-87.3) if x < f(-87.3) else x
     y = f(88.72) if y > f(88.72) else y
     shifted = y * f(1.44269504088896341) + f(12582912.0)
@@ -79,7 +84,8 @@ def log(x):
 
 @element
 def tanh(x):
-    """Hyperbolic tangent within 4 ulp, NaN for NaN: a rational function on [-7.9, 7.9], +-1 beyond in float32."""
+    """Hyperbolic tangent within 4 ulp, NaN for NaN: a rational function on [-7.9, 7.9], +-1 beyond in
+    float32."""
     y = f(7.90531110763549805) if x > f(7.90531110763549805) else x
     y = f(-7.90531110763549805) if y < f(-7.90531110763549805) else y
     s = y * y
@@ -97,14 +103,16 @@ def tanh(x):
 
 @element
 def finite(x):
-    """Whether a float32 is neither NaN nor infinite, read from its bits: reassociation turns x - x and 0 * x into 0,
+    """Whether a float32 is neither NaN nor infinite, read from its bits: reassociation turns x - x and 0 * x
+    into 0,
     and np.isfinite with them, NaN or not."""
     return (bits_of_float(x) & np.int32(0x7F800000)) != np.int32(0x7F800000)
 
 
 @kernel
 def combine(table, start, step, stride, vectors, source, count, target, rows, n, add):
-    """target_r = sum_k table[start + r step + k stride] source_k (+ target_r), for ``rows`` r and ``count`` k; rows of n."""
+    """target_r = sum_k table[start + r step + k stride] source_k (+ target_r), for ``rows`` r and ``count``
+    k; rows of n."""
     for r in range(rows):
         z = row(vectors, target + r * n, n)
         if not add:
@@ -129,7 +137,8 @@ def combine(table, start, step, stride, vectors, source, count, target, rows, n,
 
 @kernel
 def correlate(grad, start, vectors, delta, outputs, source, inputs, n, add):
-    """grad [outputs, inputs] = sum over rows of delta_j source_d (+ grad): the gradient of a weight, narrow layers."""
+    """grad [outputs, inputs] = sum over rows of delta_j source_d (+ grad): the gradient of a weight, narrow
+    layers."""
     for j in range(outputs):
         g = row(vectors, delta + j * n, n)
         target = row(grad, start + j * inputs, inputs)
@@ -157,7 +166,8 @@ def correlate(grad, start, vectors, delta, outputs, source, inputs, n, add):
 
 @kernel
 def activate(flat, layers, layer, work, n):
-    """Add the bias and apply the activation in place; SiLU leaves its slope too (it is no function of its value)."""
+    """Add the bias and apply the activation in place; SiLU leaves its slope too (it is no function of its
+    value)."""
     kind, at, slope = layers[layer, ACTIVATION], layers[layer, VALUE], layers[layer, SLOPE]
     for j in range(layers[layer, OUTPUTS]):
         b, z = flat[layers[layer, BIAS] + j], row(work, at + j * n, n)
@@ -186,7 +196,8 @@ def activate(flat, layers, layer, work, n):
 
 @glue
 def forward(flat, layers, first, last, work, n):
-    """Fill the VALUE of layers first .. last - 1; layer ``first`` reads what its FEED says (-1: the inputs at 0)."""
+    """Fill the VALUE of layers first .. last - 1; layer ``first`` reads what its FEED says (-1: the inputs
+    at 0)."""
     for layer in range(first, last):
         inputs, outputs = layers[layer, INPUTS], layers[layer, OUTPUTS]
         feed, at = layers[layer, FEED], layers[layer, VALUE]
@@ -236,7 +247,8 @@ def descend(layers, layer, work, n):
 def backward(flat, grad, layers, first, last, work, n, more, join):
     """Gradients of layers last - 1 .. first from the DELTA of the last one (by its value).
 
-    ``more``: add to the gradients (not the minibatch's first block). ``join``: add to the DELTA of the layer that
+    ``more``: add to the gradients (not the minibatch's first block). ``join``: add to the DELTA of the layer
+    that
     feeds the first one (the critic's share of a trunk, after the actor's) and do not begin it.
     """
     for layer in range(last - 1, first - 1, -1):

@@ -1,12 +1,12 @@
-"""The engine's face: torch's parameters and Adam re-homed into flat memory, and the calls into compiled code."""
+"""The engine's face: torch's parameters and Adam re-homed into flat memory, and the calls into compiled
+code."""
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,8 @@ _NO_MASK = np.zeros((0, 1), bool)
 class FusedEngine:
     """The compiled execution of ``ppo.update`` for one policy and its optimiser (torch.optim.Adam).
 
-    Both stay torch's: every parameter, and every moment of Adam, is a view of flat memory that the engine works on.
+    Both stay torch's: every parameter, and every moment of Adam, is a view of flat memory that the engine
+    works on.
     ``threads`` 2: actor and critic on a core each, unless they share a trunk; the bits are those of 1.
     """
 
@@ -47,14 +48,19 @@ class FusedEngine:
         self._flat, self._grad = plan.aligned_zeros(self._plan.size), plan.aligned_zeros(self._plan.size)
         self._moment, self._square = plan.aligned_zeros(self._plan.size), plan.aligned_zeros(self._plan.size)
         self._steps = np.zeros(len(self._plan.parameters), np.float32)
+        self._homes = [x.ctypes.data for x in (self._flat, self._moment, self._square, self._steps)]
         self._work = [plan.aligned_zeros(self._plan.work_size)]
-        self._helper, self._pace = helping.Helper(), Pace(both=threads > 1 and policy.trunk is None)
-        # products this small gain nothing from more threads, and threads that spin take the core of the other half
+        self._helper, self._pace = helping.Helper(), helping.Pace(both=threads > 1 and policy.trunk is None)
+        # products this small gain nothing from more threads, and threads that spin take the core of the
+        # other half
         self._limit = threadpoolctl.threadpool_limits(1, user_api="blas")
         self.attach()
 
     def attach(self) -> None:
-        """Make parameters and Adam's state views of the flat memory (again), taking over the numbers they hold."""
+        """Make parameters and Adam's state views of the flat memory (again), taking over the numbers they
+        hold."""
+        if self._attached():
+            return
         known = {id(p) for group in self.optimiser.param_groups for p in group["params"]}
         with torch.no_grad():
             for i, (parameter, at) in enumerate(self._plan.parameters):
@@ -67,6 +73,16 @@ class FusedEngine:
                 for name, memory in (("exp_avg", self._moment), ("exp_avg_sq", self._square)):
                     state[name] = self._view(memory, state.get(name, torch.zeros_like(parameter)), at)
                 state["step"] = self._view(self._steps, torch.as_tensor(state.get("step", 0.0)), i)
+
+    def _attached(self) -> bool:
+        state = self.optimiser.state
+        for i, (parameter, at) in enumerate(self._plan.parameters):
+            mine = state.get(parameter, {})
+            tensors = (parameter, mine.get("exp_avg"), mine.get("exp_avg_sq"), mine.get("step"))
+            homes = [first + 4 * offset for first, offset in zip(self._homes, (at, at, at, i), strict=True)]
+            if any(t is None or t.data_ptr() != home for t, home in zip(tensors, homes, strict=True)):
+                return False
+        return True
 
     @staticmethod
     def _view(memory: Array, tensor: torch.Tensor, at: int) -> torch.Tensor:
@@ -94,9 +110,11 @@ class FusedEngine:
         logp_out: Array,
         inputs_out: Array,
     ) -> None:
-        """Act on observations [B, D] float32 as they came; fills actions [B, A], logp [B] and inputs [B, D] as seen.
+        """Act on observations [B, D] float32 as they came; fills actions [B, A], logp [B] and inputs [B, D]
+        as seen.
 
-        ``mean`` None: no normalisation. ``noise`` [B, A]: uniforms for categories and bits, normals for Gaussians.
+        ``mean`` None: no normalisation. ``noise`` [B, A]: uniforms for categories and bits, normals for
+        Gaussians.
         The three outputs may be strided columns of a rollout.
         """
         numbers = (_NOTHING, _NOTHING) if mean is None else (mean, inverse_std)
@@ -159,8 +177,9 @@ class FusedEngine:
         self.attach()
         rows, columns = _rows(batch), _columns(batch)
         run = _Run(self, columns, self._options(settings, log_ratio_limit))
-        with self._pace.timed(run) as together:
-            status = run.epochs(rows, rng, settings.num_epochs, together)
+        began, together = time.perf_counter(), self._pace.choose()
+        status = run.epochs(rows, rng, settings.num_epochs, together)
+        self._pace.book(together, time.perf_counter() - began, int(run.ledgers[0, kernels.NORM_COUNT]))
         self._steps += np.float32(run.ledgers[0, kernels.STEPS])
         if status == kernels.NOT_FINITE:
             at = int(run.ledgers[0, kernels.AT])
@@ -201,7 +220,8 @@ class FusedEngine:
     def check_first_minibatch(self, batch: Batch, settings: PPOSettings) -> float:
         """Largest difference between a parameter after one step of ppo.update and after one of this engine.
 
-        Both work on copies, on the first ``minibatch_size`` rows of the batch; nothing of this engine changes.
+        Both work on copies, on the first ``minibatch_size`` rows of the batch; nothing of this engine
+        changes.
         """
         steps = batch.as_steps().select(slice(0, settings.minibatch_size))
         once = dataclasses.replace(settings, num_epochs=1)
@@ -220,37 +240,6 @@ class FusedEngine:
         FusedEngine(policy, optimiser, 1).update(policy, optimiser, batch, settings, np.random.default_rng(0))
 
 
-class Pace:
-    """Whether the second thread helps: on a machine whose cores are busy it costs more than it brings.
-
-    Both ways are timed, and the quicker one is taken; every ``RETRY`` updates the other is tried again. The result
-    is the same bit for bit, or a timing would have no business here.
-    """
-
-    RETRY = 16
-
-    def __init__(self, both: bool) -> None:
-        self.both, self.updates = both, 0
-        self.seconds: dict[bool, float] = {}
-
-    def choose(self) -> bool:
-        """True: two threads in the next update."""
-        if not self.both or len(self.seconds) < 2:
-            return self.both and True not in self.seconds
-        quicker = self.seconds[True] <= self.seconds[False]
-        return not quicker if self.updates % self.RETRY == 0 else quicker
-
-    @contextlib.contextmanager
-    def timed(self, run: _Run) -> Iterator[bool]:
-        """Choose, and book the time per minibatch of what happens inside."""
-        together, began = self.choose(), time.perf_counter()
-        yield together
-        steps = run.ledgers[0, kernels.NORM_COUNT]
-        self.updates += 1
-        if steps > 0:
-            self.seconds[together] = (time.perf_counter() - began) / steps
-
-
 class _Run:
     """One update under way."""
 
@@ -265,7 +254,8 @@ class _Run:
         e, p = self.engine, self.engine._plan
         work = e._work[1 if role == kernels.CRITIC else 0]
         return kernels.train(
-            role, begin, epoch, epochs, p.places, p.layers, p.heads, e._flat, e._grad, e._moment, e._square, work,
+            role, begin, epoch, epochs, p.places, p.layers, p.heads, e._flat, e._grad, e._moment, e._square,
+            work,
             *self.columns, self.order, self.options, self.control, self.exchange, self.ledgers,
         )  # fmt: skip
 

@@ -1,9 +1,13 @@
-"""Heads: the actor's outputs to log-probability, entropy, gradient and sample; equations of control/distributions.py.
+"""Heads: the actor's outputs to log-probability, entropy, gradient and sample; equations of
+control/distributions.py.
 
-All per row of a block, feature-major like the layers. ``heads`` is a table with a row per component of the action.
+All per row of a block, feature-major like the layers. ``heads`` is a table with a row per component of the
+action.
 ``places`` says where in ``work`` the block's matrices begin (names below).
 """
 
+# mypy: ignore-errors
+# (what numba makes of these functions is not what mypy sees)
 from __future__ import annotations
 
 import numpy as np
@@ -40,7 +44,8 @@ def clamp_log_std(x):
 
 @kernel
 def apply_mask(places, heads, work, n):
-    """Masked categories: logit -inf, so that their probability is exactly 0. (Bits see the mask themselves.)"""
+    """Masked categories: logit -inf, so that their probability is exactly 0. (Bits see the mask
+    themselves.)"""
     for c in range(len(heads)):
         if heads[c, KIND] != CATEGORICAL:
             continue
@@ -168,10 +173,12 @@ def evaluate(places, heads, flat, work, n, masked):
 
 @kernel
 def gradient(places, heads, flat, grad, work, n, entropy_share):
-    """DELTAS = d loss / d outputs, from COEFFICIENT = d loss / d logp and a loss of -entropy_share * entropy a row.
+    """DELTAS = d loss / d outputs, from COEFFICIENT = d loss / d logp and a loss of -entropy_share * entropy
+    a row.
 
     categorical: c (1[k = a] - p_k) + w p_k (log p_k + H);  bit: c (b - p) + w z p (1 - p);
-    gaussian: c (a - mean) / std^2, and c (((a - mean) / std)^2 - 1) - w for its log_std (0 outside the clamp).
+    gaussian: c (a - mean) / std^2, and c (((a - mean) / std)^2 - 1) - w for its log_std (0 outside the
+    clamp).
     """
     w, c = entropy_share, row(work, places[ROWS] + COEFFICIENT * BLOCK, n)
     for j in range(len(heads)):

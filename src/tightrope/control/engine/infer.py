@@ -1,5 +1,7 @@
 """The rollout's side, compiled: act on a batch of observations, values of many, advantages."""
 
+# mypy: ignore-errors
+# (what numba makes of these functions is not what mypy sees)
 from __future__ import annotations
 
 import numpy as np
@@ -10,13 +12,14 @@ from tightrope.control.engine.dense import BLOCK, VALUE, ZERO, f, forward
 
 
 @entry(
-    "void(int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1], float32[:,:], float32[::1], float32[::1],"
-    "float64, boolean[:,:], float32[:,:], float32[:,:], float32[:], float32[:,:])"
+    "void(int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1], float32[:,:], float32[::1],"
+    "float32[::1], float64, boolean[:,:], float32[:,:], float32[:,:], float32[:], float32[:,:])"
 )
 def act(
     places, layers, heads, flat, work, raw, mean, inverse, clip, masks, noise, actions, logp, inputs
 ):  # fmt: skip
-    """Normalise, run the actor, sample, and write actions, log-probabilities and inputs as seen, row by row."""
+    """Normalise, run the actor, sample, and write actions, log-probabilities and inputs as seen, row by
+    row."""
     normalise, limit, masked = len(mean) > 0, f(clip), masks.shape[0] > 0
     for begin in range(0, len(raw), BLOCK):
         n = BLOCK if len(raw) - begin > BLOCK else len(raw) - begin
@@ -63,7 +66,8 @@ def values(places, layers, flat, work, inputs, out):
     "float64, float64, float32[:,::1])"
 )
 def gae(rewards, values, next_values, terminated, ended, mask, gamma, gae_lambda, out):
-    """A_t = r_t + gamma V_{t+1} - V_t + gamma lambda A_{t+1}, cut as in maths.returns.gae, whatever lies behind a cut."""
+    """A_t = r_t + gamma V_{t+1} - V_t + gamma lambda A_{t+1}, cut as in maths.returns.gae, whatever lies
+    behind a cut."""
     discount, decay = f(gamma), f(gamma * gae_lambda)
     for b in range(rewards.shape[0]):
         trace = ZERO

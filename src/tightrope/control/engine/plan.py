@@ -1,4 +1,5 @@
-"""Where everything lies: one flat buffer for the parameters, one for the intermediate matrices, and tables for both."""
+"""Where everything lies: one flat buffer for the parameters, one for the intermediate matrices, and tables
+for both."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ def _aligned(size: int) -> int:
 
 @dataclass(frozen=True)
 class Plan:
-    """Offsets of parameters (in the order of the flat buffer) and the tables that the compiled functions read.
+    """Offsets of parameters (in the order of the flat buffer) and the tables that the compiled functions
+    read.
 
     ``halves``: [begin, end) of what the actor steps (trunk, actor, log_std) and of the critic.
     """
@@ -43,7 +45,7 @@ def make_plan(policy: Any) -> Plan:
     cursor = 0
     work = _aligned(policy.observation_layout.size * d.BLOCK)
 
-    def place(parameter: nn.Parameter) -> int:
+    def place(parameter: Any) -> int:
         nonlocal cursor
         at, cursor = cursor, cursor + _aligned(parameter.numel())
         parameters.append((parameter, at))

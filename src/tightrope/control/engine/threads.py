@@ -1,9 +1,13 @@
 """Two threads in one minibatch: each owns half of the parameters, and they meet at the joint gradient norm.
 
-A meeting is a counter per thread, written with release and read with acquire. A thread that waits spins for a while
-and then gives its core away; it stops waiting when the other has left. Nothing here can change a bit of the result.
+A meeting is a counter per thread, written with release and read with acquire. A thread that waits spins for
+a while
+and then gives its core away; it stops waiting when the other has left. Nothing here can change a bit of the
+result.
 """
 
+# mypy: ignore-errors
+# (what numba makes of these functions is not what mypy sees)
 from __future__ import annotations
 
 import os
@@ -13,9 +17,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tightrope.control.engine.compiled import give_way, glue, kernel, load_shared, pause, store_shared
+from tightrope.control.engine.compiled import give_way, glue, load_shared, pause, store_shared
 
-# entries of ``control`` (int64), each on a cache line of its own; role 0 is the actor's thread, role 1 the critic's
+# entries of ``control`` (int64), each on a cache line of its own; role 0 is the actor's thread, role 1 the
+# critic's
 ARRIVED, LEFT, EPOCH = 0, 32, 48
 LINE = 16
 CONTROL_SIZE = 64
@@ -55,7 +60,8 @@ class Helper:
         self.error: BaseException | None = None
 
     def start(self, job: Callable[[], object], control: np.ndarray) -> bool:
-        """Have ``job`` run beside the caller; False when no thread can be had. ``control[LEFT]`` tells its end."""
+        """Have ``job`` run beside the caller; False when no thread can be had. ``control[LEFT]`` tells its
+        end."""
         if self._thread is None or self._process != os.getpid() or not self._thread.is_alive():
             self._jobs, self._process = queue.SimpleQueue(), os.getpid()
             thread = threading.Thread(
@@ -87,3 +93,30 @@ def _serve(helper: Helper, jobs: queue.SimpleQueue) -> None:
         finally:
             control[LEFT] = 1
             del task, job, control
+
+
+class Pace:
+    """Whether the second thread helps: on a machine whose cores are busy it costs more than it brings.
+
+    Both ways are timed, and the quicker one is taken; every ``RETRY`` updates the other is tried again. The
+    result is the same bit for bit, or a timing would have no business here.
+    """
+
+    RETRY = 16
+
+    def __init__(self, both: bool) -> None:
+        self.both, self.updates = both, 0
+        self.seconds: dict[bool, float] = {}
+
+    def choose(self) -> bool:
+        """True: two threads in the next update."""
+        if not self.both or len(self.seconds) < 2:
+            return self.both and True not in self.seconds
+        quicker = self.seconds[True] <= self.seconds[False]
+        return not quicker if self.updates % self.RETRY == 0 else quicker
+
+    def book(self, together: bool, seconds: float, minibatches: int) -> None:
+        """Note how long an update took."""
+        self.updates += 1
+        if minibatches > 0:
+            self.seconds[together] = seconds / minibatches

@@ -1,10 +1,15 @@
-"""One epoch of PPO, compiled: gather, forward, loss, backward, the joint norm, Adam; equations of algorithms/ppo.py.
+"""One epoch of PPO, compiled: gather, forward, loss, backward, the joint norm, Adam; equations of
+algorithms/ppo.py.
 
-A minibatch is worked on in blocks of BLOCK rows whose gradients are added in order. ``role`` says which half this
-thread does: ACTOR, CRITIC or BOTH. Either way each half is computed by the same operations in the same order, and the
+A minibatch is worked on in blocks of BLOCK rows whose gradients are added in order. ``role`` says which half
+this
+thread does: ACTOR, CRITIC or BOTH. Either way each half is computed by the same operations in the same
+order, and the
 two meet in the same sum, so that the number of threads changes no bit.
 """
 
+# mypy: ignore-errors
+# (what numba makes of these functions is not what mypy sees)
 from __future__ import annotations
 
 import math
@@ -14,6 +19,7 @@ import numpy as np
 from tightrope.control.engine import heads as h
 from tightrope.control.engine.compiled import entry, glue, kernel, plain, row, store_shared
 from tightrope.control.engine.dense import BLOCK, DELTA, ONE, VALUE, ZERO, backward, exp, f, finite, forward
+from tightrope.control.engine.gather import gather_inputs, gather_mask, gather_vector, moments
 from tightrope.control.engine.threads import ARRIVED, EPOCH, LINE, meet, wait
 
 ACTOR, CRITIC, BOTH = 1, 2, 3
@@ -34,48 +40,6 @@ LEDGER = 16
 
 # ``exchange`` (float64): what the halves tell each other, [parity of the meeting, role, LEDGER]
 SQUARES, HALT = 0, 1
-
-
-@kernel
-def gather_inputs(places, work, inputs, order, begin, n):
-    """The block's observations, transposed to [features, n], at the beginning of ``work``."""
-    for i in range(n):
-        source = inputs[order[begin + i]]
-        for d in range(places[h.FEATURES]):
-            work[d * n + i] = source[d]
-
-
-@kernel
-def gather_mask(places, work, masks, order, begin, n):
-    """Penalties [width, n]: 0 where allowed, -inf where masked."""
-    for i in range(n):
-        source = masks[order[begin + i]]
-        for d in range(places[h.WIDTH]):
-            work[places[h.PENALTY] + d * n + i] = ZERO if source[d] else f(-np.inf)
-
-
-@kernel
-def gather_vector(places, work, name, source, order, begin, n):
-    """One number a row."""
-    target = row(work, places[h.ROWS] + name * BLOCK, n)
-    for i in range(n):
-        target[i] = source[order[begin + i]]
-
-
-@kernel
-def moments(advantages, order, begin, end):
-    """Mean and 1 / (population deviation + 1e-8) of a minibatch's advantages, in float64; 0 and 1 for a single row."""
-    count = end - begin
-    if count == 1:
-        return 0.0, 1.0
-    mean = 0.0
-    for i in range(begin, end):
-        mean += np.float64(advantages[order[i]])
-    mean /= count
-    variance = 0.0
-    for i in range(begin, end):
-        variance += (np.float64(advantages[order[i]]) - mean) * (np.float64(advantages[order[i]]) - mean)
-    return mean, 1.0 / (math.sqrt(variance / count) + 1e-8)
 
 
 @kernel
@@ -158,7 +122,8 @@ def actor_block(
 
 @glue
 def critic_block(places, layers, flat, grad, work, data, order, begin, n, count, more, join, options, ledger):
-    """The critic's half of a block: 0.5 (V - R)^2, or with value_clip the larger of that and the clipped one's."""
+    """The critic's half of a block: 0.5 (V - R)^2, or with value_clip the larger of that and the clipped
+    one's."""
     _, _, _, _, old_values, _, returns = data
     forward(flat, layers, places[h.CRITIC_FIRST], places[h.CRITIC_LAST], work, n)
     last = places[h.CRITIC_LAST] - 1
@@ -229,7 +194,8 @@ def squares(flat, grad, begin, end):
 
 @kernel
 def adam(flat, grad, mean, square, begin, end, scale, rate, step, options):
-    """torch.optim.Adam on a half: m += (1 - b1)(g - m); v = b2 v + (1 - b2) g^2; p -= a m / (sqrt(v / c2) + eps)."""
+    """torch.optim.Adam on a half: m += (1 - b1)(g - m); v = b2 v + (1 - b2) g^2; p -= a m / (sqrt(v / c2) +
+    eps)."""
     beta_1, beta_2, n = f(options[BETA_1]), f(options[BETA_2]), end - begin
     size = f(rate / (1 - options[BETA_1] ** step))
     root, epsilon = f(1 / math.sqrt(1 - options[BETA_2] ** step)), f(options[EPSILON])
@@ -264,7 +230,7 @@ def settle(role, exchange, flat, grad, moment, square, options, ledgers):
         if not role & (k + 1):
             continue
         ledger = ledgers[k]
-        if status == NOT_FINITE or status == MISMATCH:
+        if status > STOPPED:
             continue
         ledger[NORMS] += norm
         ledger[NORM_COUNT] += 1
@@ -298,17 +264,21 @@ def publish(role, exchange, flat, grad, options, ledgers, count):
 
 
 @entry(
-    "int64(int64, int64, int64, int64, int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1], float32[::1],"
-    "float32[::1], float32[::1], float32[:,::1], boolean[:,::1], float32[:,::1], float32[::1], float32[::1],"
-    "float32[::1], float32[::1], int64[::1], float64[::1], int64[::1], float64[::1], float64[:,::1])"
+    "int64(int64, int64, int64, int64, int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1],"
+    "float32[::1], float32[::1], float32[::1], float32[:,::1], boolean[:,::1], float32[:,::1], float32[::1],"
+    "float32[::1], float32[::1], float32[::1], int64[::1], float64[::1], int64[::1],"
+    "float64[::1], float64[:,::1])"
 )
 def train(
     role, begin, epoch, epochs, places, layers, heads, flat, grad, moment, square, work,
-    inputs, masks, actions, old_logp, old_values, advantages, returns, order, options, control, exchange, ledgers,
+    inputs, masks, actions, old_logp, old_values, advantages, returns, order, options, control, exchange,
+    ledgers,
 ):  # fmt: skip
-    """Run epochs ``epoch`` .. ``epochs`` - 1 of an update over the rows in ``order``, the first from row ``begin`` on.
+    """Run epochs ``epoch`` .. ``epochs`` - 1 of an update over the rows in ``order``, the first from row
+    ``begin`` on.
 
-    Returns RUNNING, or why it stopped before a step: STOPPED (KL), NOT_FINITE, MISMATCH, ALONE (the other thread left;
+    Returns RUNNING, or why it stopped before a step: STOPPED (KL), NOT_FINITE, MISMATCH, ALONE (the other
+    thread left;
     ``ledgers[2:]`` are the books before that minibatch). ``ledgers[., AT]`` is that minibatch's first row.
     """
     data = (inputs, masks, actions, old_logp, old_values, advantages, returns)

@@ -1,0 +1,77 @@
+"""Rewrite the tables of docs/control.md that the code owns: python docs/tables.py
+
+A table stands between `<!-- table:NAME -->` and `<!-- end -->`; a test fails when it is out of date.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from tightrope.algorithms.settings import range_text
+from tightrope.control.presets import BY_TASK
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+from tightrope.flags import settings_fields
+from tightrope.runs.metrics import METRICS
+
+PAGE = Path(__file__).with_name("control.md")
+
+
+def row(*cells: str) -> str:
+    """One line of a table."""
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def shown(value: Any) -> str:
+    """A value as the command line takes it."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    return "none" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def metrics() -> list[str]:
+    """Every metric, from runs/metrics.py."""
+    lines = [row("metric", "unit", "healthy", "meaning"), "|---|---|---|---|"]
+    return lines + [row(f"`{m.name}`", m.unit, m.healthy, m.doc) for m in METRICS.values()]
+
+
+def presets() -> list[str]:
+    """What the presets change for the tasks they know, from control/presets.py."""
+    lines = [row("task", "algorithm", "what it changes"), "|---|---|---|"]
+    for algorithm, tasks in BY_TASK.items():
+        for task, values in tasks.items():
+            changes = ", ".join(f"{name} {shown(value)}" for name, value in values.items())
+            lines.append(row(task, algorithm, changes))
+    return lines
+
+
+def settings() -> list[str]:
+    """Every setting, from the dataclasses; those of PPO last."""
+    lines = [row("setting", "default", "range", "meaning"), "|---|---|---|---|"]
+    for kind in (TrainSettings, ALGORITHM_SETTINGS["ppo"]):
+        for name, field in settings_fields(kind).items():
+            limits = range_text(field.metadata)
+            lines.append(row(f"`{name}`", shown(field.default), limits, field.metadata["doc"]))
+    return lines
+
+
+TABLES = {"metrics": metrics, "presets": presets, "settings": settings}
+
+
+def filled(text: str) -> str:
+    """The page with every table as the code has it now."""
+    for name, build in TABLES.items():
+        table = "\n".join([f"<!-- table:{name} -->", "", *build(), "", "<!-- end -->"])
+        text, found = re.subn(
+            rf"<!-- table:{name} -->.*?<!-- end -->", lambda _, t=table: t, text, flags=re.S
+        )
+        if found != 1:
+            raise ValueError(f"{PAGE.name} has {found} places for the table {name!r}, expected one.")
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(filled(PAGE.read_text(encoding="utf-8")), encoding="utf-8")

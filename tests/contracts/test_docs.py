@@ -1,0 +1,208 @@
+"""The docs are run: every command and every snippet of the README and of docs/, and every quotation compared.
+
+What happens to a fenced block, by its language:
+
+    python   begins with `# src/...`  must stand in that file, line for line, whatever the indentation
+             holds `>>>`              is run by doctest; the answers must be those on the page
+             else                     is run as it stands, after the blocks before it on the page
+    sh       tightrope ...            is run; TRAINING is added to train, and RESUMING to resume, so that
+                                      it takes seconds
+             make TARGET              the Makefile must have the target (to run it would run this test again)
+             python FILE              the file must be there; examples/ are run by test_examples.py
+             pip install, venv        the extras that are named must exist
+             anything else            fails: write a rule for it, or take it out
+    console  `$ command`              is run as it stands, must exit with 2 and print the lines below it
+    diff     two files                - lines stand in the first, + lines in the second, others in both
+    text     nothing (maps are checked by test_readme_tree.py)
+
+Blocks of a page share a folder that is empty at first, but for a copy of examples/.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import doctest
+import importlib.util
+import io
+import re
+import shlex
+import shutil
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from source_tree import ROOT, Block, blocks, files, name_of, pages
+
+from tightrope.cli import main
+
+TRAINING = "--total-steps 2048 --evaluate-every 0.5 --evaluation-episodes 2".split()
+RESUMING = "--total-steps 3072".split()
+LANGUAGES = {"python", "sh", "console", "diff", "text", "json"}
+QUOTED = re.compile(r"# (src/\S+\.py)\n")
+
+
+def lines_of(block: Block) -> list[str]:
+    """The commands of a shell block: comments and empty lines left out."""
+    lines = [line.partition(" #")[0].strip() for line in block.text.replace("\\\n", " ").splitlines()]
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def run(words: list[str]) -> tuple[int, str]:
+    """Exit code and everything printed by a tightrope command."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        try:
+            code = main(words)
+        except SystemExit as end:  # --help
+            code = int(end.code or 0)
+    return code, printed.getvalue()
+
+
+def run_command(line: str) -> None:
+    """One line of a shell block, by the rules above."""
+    words = shlex.split(line)
+    if words[0] == "tightrope":
+        train_for_real = words[1] == "train" and not {"--help", "--dry-run"} & set(words)
+        more = TRAINING if train_for_real else RESUMING if words[1] == "resume" else []
+        code, printed = run(words[1:] + more)
+        assert code == 0, f"{line}\n{printed}"
+        assert printed.strip(), f"{line} printed nothing"
+    elif words[0] == "make":
+        targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert set(words[1:]) <= set(targets), line
+    elif words[0] == "python" and words[1].endswith(".py"):
+        assert (ROOT / words[1]).is_file(), f"{line}: there is no such file"
+    elif words[0] in ("pip", "python", "python3", ".", "source", "git", "cd"):
+        extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+        named = re.search(r"\[(.*?)\]", line)
+        assert named is None or set(named.group(1).split(",")) <= set(extras), line
+    else:
+        raise AssertionError(f"no rule for this command: {line}")
+
+
+def run_console(text: str) -> None:
+    """Commands that fail as shown."""
+    for part in text.split("$ ")[1:]:
+        command, *expected = part.strip().splitlines()
+        code, printed = run(shlex.split(command)[1:])
+        assert code == 2, f"{command} gave {code}\n{printed}"
+        for line in expected:
+            assert line in printed, f"{command} printed\n{printed}and not\n{line}"
+
+
+def run_python(block: Block, page: Path, names: dict[str, Any]) -> None:
+    """A snippet, or a doctest, in the names of its page."""
+    if ">>> " in block.text:
+        test = doctest.DocTestParser().get_doctest(block.text, names, page.name, str(page), block.line)
+        printed = io.StringIO()
+        result = doctest.DocTestRunner().run(test, out=printed.write, clear_globs=False)
+        names.update(test.globs)
+        assert result.failed == 0, printed.getvalue()
+        return
+    padding = "\n" * (block.line - 1)  # so that a traceback names the line of the page
+    exec(compile(padding + block.text, str(page), "exec"), names)
+
+
+def stands_in(quoted: str, text: str) -> bool:
+    """Whether lines stand together in a text, at whatever indentation; `...` alone skips lines."""
+    whole = text.splitlines()
+    for chunk in re.split(r"^\s*\.\.\.\s*\n", quoted, flags=re.MULTILINE):
+        lines = dedented(chunk.splitlines())
+        places = range(len(whole) - len(lines) + 1)
+        if not any(dedented(whole[i : i + len(lines)]) == lines for i in places):
+            return False
+    return True
+
+
+def dedented(lines: list[str]) -> list[str]:
+    """Lines without the indentation that they share."""
+    depth = min((len(line) - len(line.lstrip()) for line in lines if line.strip()), default=0)
+    return [line[depth:].rstrip() for line in lines]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty folder to run a page in, with the examples; modules that a page imports do not stay."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    before, search = set(sys.modules), list(sys.path)
+    yield tmp_path
+    sys.path[:] = search
+    for name in set(sys.modules) - before:
+        if not (getattr(sys.modules[name], "__file__", None) or "").startswith(str(tmp_path)):
+            continue
+        del sys.modules[name]
+
+
+@pytest.mark.parametrize("page", pages(), ids=name_of)
+def test_commands_and_snippets_run(page: Path, folder: Path):
+    names: dict[str, Any] = {"__name__": "page"}
+    for block in blocks(page):
+        assert block.language in LANGUAGES or not block.language, f"{page.name}:{block.line} {block.language}"
+        if block.language == "sh":
+            for line in lines_of(block):
+                run_command(line)
+        elif block.language == "console":
+            run_console(block.text)
+        elif block.language == "python" and not QUOTED.match(block.text):
+            run_python(block, page, names)
+
+
+@pytest.mark.parametrize("page", pages(), ids=name_of)
+def test_quotations_are_true(page: Path):
+    for block in blocks(page):
+        quotation = QUOTED.match(block.text)
+        if quotation:
+            text = (ROOT / quotation.group(1)).read_text(encoding="utf-8")
+            quoted = block.text[quotation.end() :]
+            assert stands_in(quoted, text), f"{page.name}:{block.line} is not in {quotation.group(1)}"
+
+
+def test_quotations_are_compared_line_by_line():
+    assert stands_in("a = 1\nif b:\n    c\n", "def f():\n    a = 1\n    if b:\n        c\n")
+    assert not stands_in("a = 1\nif b:\n    c\n", "def f():\n    a = 1\n    if b:\n        d\n")
+    assert not stands_in("a = 1\nc\n", "a = 1\nb\nc\n")
+    assert stands_in("a = 1\n...\nc\n", "a = 1\nb\nc\n")
+
+
+@pytest.mark.parametrize("page", pages(), ids=name_of)
+def test_diffs_are_true(page: Path):
+    """Every line of a shown diff stands in the file it is said to be from, and a changed one not in the other."""
+    for block in (b for b in blocks(page) if b.language == "diff"):
+        first, second, *lines = block.text.splitlines()
+        texts = [(ROOT / line[4:]).read_text(encoding="utf-8") for line in (first, second)]
+        old, new = ({line.strip() for line in text.splitlines()} for text in texts)
+        for line in lines:
+            stripped = line[1:].strip()
+            assert (stripped in old) == (line[0] in "- "), f"{page.name}: {line}"
+            assert (stripped in new) == (line[0] in "+ "), f"{page.name}: {line}"
+
+
+def load(path: Path) -> Any:
+    """A script of docs/ as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_generated_tables_are_up_to_date():
+    tables = load(ROOT / "docs/tables.py")
+    text = tables.PAGE.read_text(encoding="utf-8")
+    assert tables.filled(text) == text, "run: python docs/tables.py"
+
+
+def test_the_picture_is_what_the_mathematics_gives():
+    picture = load(ROOT / "docs/images/clip.py")
+    assert (ROOT / "docs/images/clip.svg").read_text() == picture.draw(), "run: python docs/images/clip.py"
+
+
+def test_every_picture_is_shown_somewhere():
+    text = "".join(page.read_text(encoding="utf-8") for page in pages())
+    pictures = files(".svg", ".png", ".gif", under=ROOT / "docs/images")
+    assert pictures and not [p.name for p in pictures if f"images/{p.name}" not in text]

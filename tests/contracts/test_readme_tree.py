@@ -1,0 +1,70 @@
+"""The README's map is the disk: everything listed exists, every file of the package is listed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from source_tree import ROOT, SRC, blocks, files, name_of, pages, sources
+
+
+def listed(text: str) -> dict[str, str]:
+    """Path and description of every line of a map whose folders end in a slash and are indented by two."""
+    found: dict[str, str] = {}
+    folders: list[tuple[int, str]] = []
+    for line in text.splitlines():
+        match = re.fullmatch(r"( *)(\S+)(?:\s{2,}(\S.*))?", line)
+        assert match is not None, f"not a line of a map: {line!r}"
+        depth = len(match.group(1))
+        folders = [(d, name) for d, name in folders if d < depth]
+        path = "".join(name for _, name in folders) + match.group(2)
+        if path.endswith("/"):
+            folders.append((depth, match.group(2)))
+        found[path.rstrip("/")] = match.group(3) or ""
+    return found
+
+
+MAP = listed(next(b for b in blocks(ROOT / "README.md") if "src/tightrope/\n" in b.text).text)
+
+
+def test_everything_listed_is_there():
+    assert not [path for path in MAP if not (ROOT / path).exists()]
+
+
+def test_every_source_file_is_listed():
+    """A folder whose insides are not shown stands for its files."""
+    shown = {path for path in MAP if (ROOT / path).is_file()}
+    opened = {str(Path(path).parent) for path in shown} | {"src/tightrope"}
+    missing = []
+    for path in sources():
+        name = name_of(path)
+        folder = next(p for p in Path(name).parents if str(p) in MAP)
+        if path.name != "__init__.py" and name not in shown and str(folder) in opened:
+            missing.append(name)
+    assert not missing, f"not in the README's map: {missing}"
+
+
+def test_every_folder_is_listed():
+    parts = {name_of(p.parent) for p in sources() if p.parent.parent == SRC}
+    tops = {name_of(p).split("/")[0] for p in files() if "/" in name_of(p)} - {".ci", "src"}
+    assert parts | tops <= set(MAP), (parts | tops) - set(MAP)
+
+
+def test_every_line_explains():
+    assert not [path for path, words in MAP.items() if path != "src/tightrope" and len(words) < 8]
+
+
+@pytest.mark.parametrize("page", pages(), ids=name_of)
+def test_links_lead_somewhere(page: Path):
+    """Files and headings that a page links to exist."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if target.startswith(("http://", "https://")):
+            continue
+        name, _, heading = target.partition("#")
+        path = (page.parent / name).resolve() if name else page
+        assert path.exists(), f"{target} is not there"
+        if heading:
+            titles = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            anchors = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+            assert heading in anchors, f"{target}: {name_of(path)} has no such heading"
