@@ -33,13 +33,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
 from source_tree import ROOT, Block, blocks, files, name_of, pages
 
 from tightrope.cli import main
 
-TRAINING = "--total-steps 2048 --evaluate-every 0.5 --evaluation-episodes 2".split()
-RESUMING = "--total-steps 3072".split()
+TRAINING = ["--total-steps", "2048", "--evaluate-every", "0.5", "--evaluation-episodes", "2"]
+RESUMING = ["--total-steps", "3072"]
 LANGUAGES = {"python", "sh", "console", "diff", "text", "json"}
 QUOTED = re.compile(r"# (src/\S+\.py)\n")
 
@@ -51,13 +52,15 @@ def lines_of(block: Block) -> list[str]:
 
 
 def run(words: list[str]) -> tuple[int, str]:
-    """Exit code and everything printed by a tightrope command."""
-    printed = io.StringIO()
+    """Exit code and output of a tightrope command; tasks it registers are forgotten, as with a process."""
+    printed, known = io.StringIO(), set(gymnasium.registry)
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         try:
             code = main(words)
         except SystemExit as end:  # --help
             code = int(end.code or 0)
+    for name in set(gymnasium.registry) - known:
+        del gymnasium.registry[name]
     return code, printed.getvalue()
 
 
@@ -171,7 +174,7 @@ def test_quotations_are_compared_line_by_line():
 
 @pytest.mark.parametrize("page", pages(), ids=name_of)
 def test_diffs_are_true(page: Path):
-    """Every line of a shown diff stands in the file it is said to be from, and a changed one not in the other."""
+    """Every line of a shown diff stands in the file it is said to be from, a changed one in no other."""
     for block in (b for b in blocks(page) if b.language == "diff"):
         first, second, *lines = block.text.splitlines()
         texts = [(ROOT / line[4:]).read_text(encoding="utf-8") for line in (first, second)]

@@ -42,7 +42,7 @@ def test_the_check_can_fail():
 
 
 def test_only_text_and_pictures_are_kept():
-    """No archives, weights or notebooks: what cannot be read in a diff does not belong into the repository."""
+    """No archives, weights or notebooks: what a diff cannot show does not belong into the repository."""
     pictures = {".png", ".gif", ".svg", ".jpg", ".webp"}
     known = TEXT | pictures | {".typed"}
     kept = [path for path in files() if path.suffix not in known and path.parent != ROOT]

@@ -1,6 +1,10 @@
 """The compiled update is ppo.update: same parameters, metrics and permutations, whatever the settings."""
 
 import copy
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -175,3 +179,23 @@ def test_unsupported_names_the_reason():
     policy, _, settings = make()
     assert "cuda" in (unsupported(policy, settings, "cuda", "ppo") or "")
     assert "a2c" in (unsupported(policy, settings, "cpu", "a2c") or "")
+
+
+def test_the_process_ends_cleanly_right_after_an_update_with_two_threads():
+    lines = [
+        "import numpy as np",
+        "from engine_cases import make, make_batch",
+        "from tightrope.control.engine import FusedEngine",
+        "policy, optimiser, settings = make()",
+        "engine = FusedEngine(policy, optimiser, 2)",
+        "engine.update(policy, optimiser, make_batch(policy), settings, np.random.default_rng(0))",
+    ]
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    ended = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert ended.returncode == 0, ended.stderr

@@ -10,9 +10,10 @@ result.
 # (what numba makes of these functions is not what mypy sees)
 from __future__ import annotations
 
-import os
+import contextlib
 import queue
 import threading
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -24,7 +25,7 @@ from tightrope.control.engine.compiled import give_way, glue, load_shared, pause
 ARRIVED, LEFT, EPOCH = 0, 32, 48
 LINE = 16
 CONTROL_SIZE = 64
-SPINS = 300
+SPINS = 2000
 
 
 @glue
@@ -51,48 +52,53 @@ def meet(control, role):
 
 
 class Helper:
-    """A thread that runs the critic's half of updates; made when first needed, also again after a fork."""
+    """A thread that runs the critic's half of updates; made when first needed, also again after a fork.
+
+    It ends with this object, and before the interpreter does: a thread that comes back from compiled code while
+    the interpreter is being taken down aborts the process.
+    """
 
     def __init__(self) -> None:
         self._thread: threading.Thread | None = None
-        self._process = 0
-        self._jobs: queue.SimpleQueue[tuple[Callable[[], object], np.ndarray] | None] = queue.SimpleQueue()
-        self.error: BaseException | None = None
+        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
+        self._end: weakref.finalize | None = None
 
     def start(self, job: Callable[[], object], control: np.ndarray) -> bool:
-        """Have ``job`` run beside the caller; False when no thread can be had. ``control[LEFT]`` tells its
-        end."""
-        if self._thread is None or self._process != os.getpid() or not self._thread.is_alive():
-            self._jobs, self._process = queue.SimpleQueue(), os.getpid()
-            thread = threading.Thread(
-                target=_serve, args=(self, self._jobs), name="tightrope-critic", daemon=True
-            )
+        """Have ``job`` run beside the caller; False when no thread can be had. ``control[LEFT]`` tells its end."""
+        if self._thread is None or not self._thread.is_alive():
+            jobs: queue.SimpleQueue = queue.SimpleQueue()
+            thread = threading.Thread(target=_serve, args=(jobs,), name="tightrope-critic", daemon=True)
             try:
                 thread.start()
             except RuntimeError:  # the system grants no more threads
                 return False
-            self._thread = thread
-        self.error = None
+            self._thread, self._jobs = thread, jobs
+            self._end = weakref.finalize(self, _end, thread, jobs)
         self._jobs.put((job, control))
         return True
 
     def stop(self) -> None:
         """End the thread."""
-        if self._thread is not None and self._process == os.getpid():
-            self._jobs.put(None)
-        self._thread = None
+        if self._end is not None:
+            self._end()
+        self._thread = self._end = None
 
 
-def _serve(helper: Helper, jobs: queue.SimpleQueue) -> None:
+def _serve(jobs: queue.SimpleQueue) -> None:
     while (task := jobs.get()) is not None:
         job, control = task
-        try:
+        with contextlib.suppress(
+            BaseException
+        ):  # the other thread sees that this one left, and does both halves
             job()
-        except BaseException as error:  # whatever it was, the other thread must not wait for this one
-            helper.error = error
-        finally:
-            control[LEFT] = 1
-            del task, job, control
+        control[LEFT] = 1
+        del task, job, control
+
+
+def _end(thread: threading.Thread, jobs: queue.SimpleQueue) -> None:
+    jobs.put(None)
+    if thread is not threading.current_thread():
+        thread.join(timeout=10)
 
 
 class Pace:
