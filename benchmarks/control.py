@@ -144,7 +144,7 @@ def table() -> str:
 
 def render(path: Path) -> None:
     """Put the table between the page's markers."""
-    begin, end = "<!-- figures:returns -->", "<!-- /figures:returns -->"
+    begin, end = "<!-- figures:returns -->", "<!-- figures:end -->"
     text = path.read_text()
     if begin not in text:
         return

@@ -19,8 +19,8 @@ PUBLISHED = {
 }
 PUBLISHED_SOURCE = (
     "PureJaxRL's published ppo.py (jax 0.10.2, gymnax 0.0.8, environment compiled too, 2 threads, no entropy "
-    "term), total steps / time of the compiled call, was measured earlier on two cores of an AMD EPYC (Zen 4),"
-    " the same kind of machine, not this run"
+    "term), total steps / time of the compiled call, was measured earlier on two cores of an AMD EPYC "
+    "(Zen 4): the same kind of machine, not this run"
 )
 
 

@@ -54,7 +54,8 @@ def meet(control, role):
 class Helper:
     """A thread that runs the critic's half of updates; made when first needed, also again after a fork.
 
-    It ends with this object, and before the interpreter does: a thread that comes back from compiled code while
+    It ends with this object, and before the interpreter does: a thread that comes back from compiled code
+    while
     the interpreter is being taken down aborts the process.
     """
 
@@ -64,7 +65,8 @@ class Helper:
         self._end: weakref.finalize | None = None
 
     def start(self, job: Callable[[], object], control: np.ndarray) -> bool:
-        """Have ``job`` run beside the caller; False when no thread can be had. ``control[LEFT]`` tells its end."""
+        """Run ``job`` beside the caller; False if there is no thread to be had. ``control[LEFT]`` tells
+        the end."""
         if self._thread is None or not self._thread.is_alive():
             jobs: queue.SimpleQueue = queue.SimpleQueue()
             thread = threading.Thread(target=_serve, args=(jobs,), name="tightrope-critic", daemon=True)
@@ -87,9 +89,7 @@ class Helper:
 def _serve(jobs: queue.SimpleQueue) -> None:
     while (task := jobs.get()) is not None:
         job, control = task
-        with contextlib.suppress(
-            BaseException
-        ):  # the other thread sees that this one left, and does both halves
+        with contextlib.suppress(BaseException):  # the other thread sees it, and does both halves
             job()
         control[LEFT] = 1
         del task, job, control

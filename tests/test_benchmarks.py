@@ -1,0 +1,166 @@
+"""The speed benchmark's own arithmetic, with numbers worked out by hand, and the page that it fills."""
+
+from __future__ import annotations
+
+import ast
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+BENCHMARKS = ROOT / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
+
+import scaling  # noqa: E402
+import speed  # noqa: E402
+import speed_peers  # noqa: E402
+import speed_report as report  # noqa: E402
+
+SMALL = speed.SCENARIOS[0]
+
+
+def test_rate_is_a_difference():
+    """3 s of start-up in both processes change nothing: 10,000 steps in 2 s."""
+    assert report.rate({"steps": 1000, "wall": 3.2}, {"steps": 11_000, "wall": 5.2}) == pytest.approx(5000)
+
+
+@pytest.mark.parametrize("steps, wall", [(2000, 3.1), (1000, 4.0)])
+def test_rate_refuses_noise(steps: int, wall: float):
+    with pytest.raises(ValueError, match="longer|long run"):
+        report.rate({"steps": 1000, "wall": 3.2}, {"steps": steps, "wall": wall})
+
+
+def test_ratio_is_the_median_over_pairs():
+    """A machine that slows both sides down for a pair leaves the ratio as it is."""
+    found = report.ratio([100.0, 10.0, 90.0], [10.0, 1.0, 5.0])
+    assert found == {"median": 10.0, "low": 10.0, "high": 18.0}
+
+
+def test_flops_of_an_update():
+    """4-64-64-2, 64 rows, 256 + 4096 + 128 = 4480 weights: forward and weight gradients 2 * 64 * 4480 each,
+    gradients of the inputs of layers two and three 2 * 64 * 4224.
+    """
+    assert report.update_flops([(4, 64, 64, 2)], 64) == 573_440 + 573_440 + 540_672
+    both = report.update_flops([(4, 64, 64, 2), (4, 64, 64, 1)], 64)
+    assert both == 1_687_552 + 1_662_976
+    assert report.floor_microseconds(both, 112.0) == pytest.approx(29.915, abs=1e-3)
+
+
+def test_optimiser_steps_round_up():
+    assert report.optimiser_steps(rollouts=3, rows=2048, num_epochs=10, minibatch_size=64) == 3 * 10 * 32
+    assert report.optimiser_steps(rollouts=1, rows=2049, num_epochs=10, minibatch_size=64) == 10 * 33
+
+
+@pytest.mark.parametrize("count, phantoms, good", [
+    (640, False, True),
+    (639, False, False),
+    (641, False, False),
+    (640, True, True),
+    (660, True, True),
+    (639, True, False),  # fewer steps than its transitions call for
+    (1280, True, False),
+])  # fmt: skip
+def test_work_is_checked(count: int, phantoms: bool, good: bool):
+    run = {"contender": "somebody", "steps": 4096, "optimiser_steps": count}
+    if good:
+        report.check_work(SMALL, run, phantoms=phantoms)
+    else:
+        with pytest.raises(ValueError, match="somebody took"):
+            report.check_work(SMALL, run, phantoms=phantoms)
+
+
+def test_shares_add_up():
+    shares = report.shares({"env": 50.0, "act": 10.0, "advantages": 5.0, "update": 30.0, "rest": 5.0})
+    assert shares["env"] == pytest.approx(0.5)
+    assert sum(shares.values()) == pytest.approx(1)
+
+
+def test_flags_are_those_of_the_command_line():
+    """What speed.py says on the command line is read back as the settings it means."""
+    from tightrope.options import overrides, train_options
+
+    wanted = report.tightrope_settings(SMALL) | {"total_steps": 2048}
+    env, values = overrides(*train_options(["CartPole-v1", *report.flags(wanted)]))
+    assert env == "CartPole-v1"
+    assert {name: values[name] for name in wanted} == wanted
+
+
+def test_peers_get_the_same_settings():
+    """Every number of a scenario that a peer knows reaches its constructor."""
+    source = (BENCHMARKS / "speed_peers.py").read_text()
+    read = {
+        node.slice.value
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant)
+    }
+    assert set(SMALL) - {"name", "between", "rollouts"} <= read
+    assert "tightrope" not in {
+        alias.name.split(".")[0]
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
+    assert set(speed_peers.PACKAGES) == {"stable-baselines3", "sbx"}
+
+
+def test_fit_of_a_line():
+    found = scaling.fit([(1, 5.0), (2, 7.0), (4, 11.0)])  # 3 + 2 x
+    assert found["intercept"] == pytest.approx(3) and found["slope"] == pytest.approx(2)
+    assert found["spread"] == pytest.approx(0, abs=1e-12)
+    assert found["exponent"] < 1
+    assert scaling.fit([(1, 2.0), (10, 20.0), (100, 200.0)])["exponent"] == pytest.approx(1)
+
+
+def test_a_block_is_replaced_and_nothing_else():
+    page = "before\n<!-- speed -->\nold\n<!-- /speed -->\nafter\n"
+    once = report.fill(page, "speed", "new \\1")
+    assert once == "before\n<!-- speed -->\n\nnew \\1\n\n<!-- /speed -->\nafter\n"
+    assert report.fill(once, "speed", "new \\1") == once
+    with pytest.raises(ValueError, match="scaling"):
+        report.fill(page, "scaling", "new")
+
+
+def _pair(ours: float, theirs: float) -> dict[str, dict[str, float]]:
+    return {"tightrope": {"rate": ours}, "stable-baselines3": {"rate": theirs}}
+
+
+def test_the_report_names_every_figure():
+    breakdown = dict.fromkeys(report.PARTS, 20.0) | {"minibatch_microseconds": 50.0, "flops": 3_350_528}
+    results = {
+        "date": "2026-01-02", "command": "python benchmarks/speed.py", "sgemm_gflops": 112.0,
+        "machine": {"cpu": "a CPU", "cores": 2, "system": "Linux x86_64"},
+        "versions": {"torch": "2"}, "peers": {"stable-baselines3": {"stable-baselines3": "2.9.2"}},
+        "start_up": {
+            "cold_seconds": 20.0, "cold_memory_mb": 500.0, "warm_seconds": 2.5, "warm_memory_mb": 300.0,
+        },
+        "scenarios": [SMALL | {
+            "pairs": [_pair(60_000, 3000)], "rates": {"tightrope": 60_000.0, "stable-baselines3": 3000.0},
+            "ratios": {"stable-baselines3": report.ratio([60_000], [3000])},
+            "memory_mb": {"tightrope": 300.0, "stable-baselines3": 320.0},
+            "breakdown": breakdown | {"backend": "vector"},
+        }],
+    }  # fmt: skip
+    text = report.speed_text(results)
+    for figure in ("60,000", "3,000", "20.0 (20.0-20.0)", "59,000", "60 %", "29.9", "17.5 s", "320"):
+        assert figure in text, figure
+
+
+def test_the_page_holds_the_committed_figures(tmp_path: Path):
+    """Rendering again changes nothing: no figure was typed, and none is older than its JSON."""
+    text = speed.PAGE.read_text(encoding="utf-8")
+    copy = tmp_path / "performance.md"
+    copy.write_text(text, encoding="utf-8")
+    speed.render(copy, speed.RESULTS, speed.SCALING)
+    assert copy.read_text(encoding="utf-8") == text, "run: python benchmarks/speed.py --render"
+
+
+def test_committed_results_are_whole_runs():
+    """A committed file comes from the full benchmark: all scenarios, five pairs or more, a peer beside."""
+    if not speed.RESULTS.exists():
+        pytest.skip("no results are committed yet")
+    results = json.loads(speed.RESULTS.read_text(encoding="utf-8"))
+    assert [s["name"] for s in results["scenarios"]] == [s["name"] for s in speed.SCENARIOS]
+    assert all(len(s["pairs"]) >= 5 for s in results["scenarios"])
+    assert "stable-baselines3" in results["peers"]
