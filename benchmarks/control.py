@@ -56,13 +56,15 @@ def run_once(task: str, algorithm: str, steps: int, seed: int, core: int | None)
     pin = (lambda: os.sched_setaffinity(0, {core})) if core is not None else None
 
     def call(arguments: list[str]) -> dict[str, Any]:
-        done = subprocess.run(
+        finished = subprocess.run(
             [*tightrope, *arguments, "--json", "--quiet"],
             capture_output=True, text=True, env=environment, preexec_fn=pin, check=False,
         )  # fmt: skip
-        if done.returncode:
-            raise RuntimeError(f"{' '.join(arguments)} exited {done.returncode}: {done.stderr[-2000:]}")
-        return json.loads(done.stdout.strip().splitlines()[-1])
+        if finished.returncode:
+            raise RuntimeError(
+                f"{' '.join(arguments)} exited {finished.returncode}: {finished.stderr[-2000:]}"
+            )
+        return json.loads(finished.stdout.strip().splitlines()[-1])
 
     flags = FLAGS.get(algorithm, ["--algorithm", algorithm])
     with tempfile.TemporaryDirectory() as folder:

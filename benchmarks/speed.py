@@ -78,15 +78,16 @@ SCENARIOS = (
     _scenario("lunarlander", "LunarLander-v3", (8, 256, 64, 10), (2, 27)),
     _scenario("halfcheetah", "HalfCheetah-v5", (8, 256, 64, 10), (2, 27)),
 )
+LEAST_SECONDS = 1.0  # of training between n1 and n2; start-up varies by a tenth of that
 QUICK = {"cartpole-zoo": (2, 22), "cartpole-large": (1, 4)}  # the others: (1, 4) rollouts too
 
 
-def measure(train: Any, between: tuple[int, int]) -> dict[str, Any]:
-    """A rate by difference; taken again when other work on the machine made the short run the longer one."""
+def measure(train: Any, between: tuple[int, int], least_seconds: float) -> dict[str, Any]:
+    """A rate by difference; taken again when other work on the machine spoiled the difference."""
     for attempt in range(3):
         short, long = train(between[0]), train(between[1])
         with contextlib.suppress(ValueError) if attempt < 2 else contextlib.nullcontext():
-            return {"rate": report.rate(short, long), "short": short, "long": long}
+            return {"rate": report.rate(short, long, least_seconds), "short": short, "long": long}
     raise AssertionError("unreachable")
 
 
@@ -103,7 +104,9 @@ def start_up(scenario: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def compare(scenario: dict[str, Any], peers: dict[str, str], pairs: int) -> dict[str, Any]:
+def compare(
+    scenario: dict[str, Any], peers: dict[str, str], pairs: int, least_seconds: float
+) -> dict[str, Any]:
     """Everything about one scenario; ``peers``: name -> interpreter."""
     contenders: dict[str, Any] = {"tightrope": lambda n, **more: train_ours(scenario, n, **more)}
     for peer, python in peers.items():
@@ -120,7 +123,7 @@ def compare(scenario: dict[str, Any], peers: dict[str, str], pairs: int) -> dict
     found: list[dict[str, Any]] = []
     for k in range(pairs):
         order = list(contenders) if k % 2 == 0 else list(reversed(contenders))
-        found.append({name: measure(contenders[name], scenario["between"]) for name in order})
+        found.append({name: measure(contenders[name], scenario["between"], least_seconds) for name in order})
         rates = ", ".join(f"{name} {found[-1][name]['rate']:,.0f}" for name in contenders)
         _say(f"{scenario['name']} pair {k + 1} of {pairs}: {rates} steps/s")
     rates = {name: [pair[name]["rate"] for pair in found] for name in contenders}
@@ -181,6 +184,7 @@ def benchmark(options: argparse.Namespace) -> dict[str, Any]:
     results: dict[str, Any] = {
         "date": datetime.date.today().isoformat(),
         "command": shlex.join(["python", "benchmarks/speed.py", *_public_words(sys.argv[1:])]),
+        "quick": options.quick,
         "machine": machine(),
         "versions": _versions(),
         "peers": peers,
@@ -190,9 +194,8 @@ def benchmark(options: argparse.Namespace) -> dict[str, Any]:
     }
     train_ours(SCENARIOS[0], 1)  # whatever it had to compile is in the usual cache from here on
     for scenario in _scenarios(options):
-        found = compare(
-            scenario, dict.fromkeys(peers, options.peer_python), 1 if options.quick else options.pairs
-        )
+        pairs, least = (1, 0.0) if options.quick else (options.pairs, LEAST_SECONDS)
+        found = compare(scenario, dict.fromkeys(peers, options.peer_python), pairs, least)
         results["scenarios"].append(found)
         results["sgemm_gflops"] = max(s["sgemm_gflops"] for s in results["scenarios"])
         if options.results is not None:

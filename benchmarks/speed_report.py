@@ -72,17 +72,18 @@ def flags(settings: dict[str, Any]) -> list[str]:
     return words
 
 
-def rate(short: dict[str, Any], long: dict[str, Any]) -> float:
+def rate(short: dict[str, Any], long: dict[str, Any], least_seconds: float = 0.0) -> float:
     """Steps/s by difference: (steps2 - steps1) / (wall2 - wall1) of a short and a long process.
 
     Both processes pay the same start-up and the same end, so that the difference holds training alone.
-    ValueError when the long run took no longer than the short one: then noise is all there is.
+    ValueError when the long run took less than ``least_seconds`` more than the short one: the start-up of two
+    processes differs by tenths of a second, and a small difference would be mostly that.
     """
     steps, wall = long["steps"] - short["steps"], long["wall"] - short["wall"]
-    if steps <= 0 or wall <= 0:
+    if steps <= 0 or wall <= max(0.0, least_seconds):
         raise ValueError(
-            f"the long run took {wall:.3f} s and {steps} steps more than the short; expected more of both. "
-            "Run fewer programs beside the benchmark, or more steps."
+            f"the long run took {wall:.3f} s and {steps} steps more than the short; expected more than "
+            f"{least_seconds:g} s. Run fewer programs beside the benchmark, or more steps."
         )
     return steps / wall
 
@@ -234,8 +235,10 @@ def speed_text(results: dict[str, Any]) -> str:
         for peer, found in results["peers"].items()
     )
     pairs = min((len(s["pairs"]) for s in results["scenarios"]), default=0)
+    trial = ["**A trial (--quick): differences this short are mostly noise. Not a measurement.**", ""]
     return "\n".join(
         [
+            *(trial if results["quick"] else []),
             f"Measured {results['date']} on {machine['cpu']}, {machine['cores']} cores, {machine['system']}:",
             f"`{results['command']}`, {pairs} pairs a scenario.",
             f"tightrope with {versions}. Peers: {peers or 'none found'}.",

@@ -32,6 +32,13 @@ def test_rate_refuses_noise(steps: int, wall: float):
         report.rate({"steps": 1000, "wall": 3.2}, {"steps": steps, "wall": wall})
 
 
+def test_rate_refuses_a_difference_within_the_noise():
+    short, long = {"steps": 1000, "wall": 3.0}, {"steps": 7000, "wall": 3.03}
+    assert report.rate(short, long) == pytest.approx(200_000)  # thirty milliseconds of start-up noise
+    with pytest.raises(ValueError, match="more than 1 s"):
+        report.rate(short, long, least_seconds=1.0)
+
+
 def test_ratio_is_the_median_over_pairs():
     """A machine that slows both sides down for a pair leaves the ratio as it is."""
     found = report.ratio([100.0, 10.0, 90.0], [10.0, 1.0, 5.0])
@@ -129,6 +136,7 @@ def _pair(ours: float, theirs: float) -> dict[str, dict[str, float]]:
 def test_the_report_names_every_figure():
     breakdown = dict.fromkeys(report.PARTS, 20.0) | {"minibatch_microseconds": 50.0, "flops": 3_350_528}
     results = {
+        "quick": False,
         "date": "2026-01-02", "command": "python benchmarks/speed.py", "sgemm_gflops": 112.0,
         "machine": {"cpu": "a CPU", "cores": 2, "system": "Linux x86_64"},
         "versions": {"torch": "2"}, "peers": {"stable-baselines3": {"stable-baselines3": "2.9.2"}},
@@ -163,4 +171,4 @@ def test_committed_results_are_whole_runs():
     results = json.loads(speed.RESULTS.read_text(encoding="utf-8"))
     assert [s["name"] for s in results["scenarios"]] == [s["name"] for s in speed.SCENARIOS]
     assert all(len(s["pairs"]) >= 5 for s in results["scenarios"])
-    assert "stable-baselines3" in results["peers"]
+    assert "stable-baselines3" in results["peers"] and not results["quick"]

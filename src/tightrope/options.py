@@ -44,11 +44,13 @@ def _common(parser: Parser, *, run: bool) -> None:
     group.add_argument(
         "--env-module",
         metavar="FILE.py",
-        help="Python file or module to import first: it registers environments.",
+        help="Python file or module to import first: it registers environments (default: none).",
     )
     if run:
         group.add_argument(
-            "--env", metavar="ID", help="The task again; needed where its id names a module (module:Task-v0)."
+            "--env",
+            metavar="ID",
+            help="The task again; needed where its id names a module (default: the run's own).",
         )
 
 
@@ -79,7 +81,9 @@ def train_parser(algorithm: str = "ppo") -> Parser:
     group.add_argument(
         "--run-dir", metavar="FOLDER", help="Where the run lies (default runs/ENV-ALGORITHM-SEED-TIME)."
     )
-    group.add_argument("--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it.")
+    group.add_argument(
+        "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
+    )
     group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
     _common(parser, run=False)
     return parser
@@ -119,7 +123,12 @@ def record_parser() -> Parser:
     group.add_argument("--out", metavar="FILE.mp4", help="Where to (default RUN/videos/).")
     group.add_argument("--episodes", type=_at_least_one, metavar="N", help="How many (default 1).")
     group.add_argument("--best", action="store_true", help="The policy that evaluated best, not the newest.")
-    group.add_argument("--seed", type=_not_negative, metavar="N", help="Seed of the episodes.")
+    group.add_argument(
+        "--seed",
+        type=_not_negative,
+        metavar="N",
+        help="Seed of the episodes (default: fixed, unused in training).",
+    )
     _common(parser, run=True)
     return parser
 
@@ -134,7 +143,10 @@ def resume_parser() -> Parser:
     parser.add_argument("run", metavar="RUN", help="Run folder.")
     group = parser.add_argument_group("going on")
     group.add_argument(
-        "--total-steps", type=_at_least_one, metavar="N", help="A new end; also continues a finished run."
+        "--total-steps",
+        type=_at_least_one,
+        metavar="N",
+        help="A new end; also continues a finished run (default: the run's own).",
     )
     _common(parser, run=True)
     return parser

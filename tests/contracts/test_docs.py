@@ -145,7 +145,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_commands_and_snippets_run(page: Path, folder: Path):
     names: dict[str, Any] = {"__name__": "page"}
     for block in blocks(page):
-        assert block.language in LANGUAGES or not block.language, f"{page.name}:{block.line} {block.language}"
+        assert block.language in LANGUAGES, f"{page.name}:{block.line} has the language {block.language!r}"
         if block.language == "sh":
             for line in lines_of(block):
                 run_command(line)

@@ -63,7 +63,11 @@ def parameters(agent):
 )
 def test_nan_from_an_environment_is_named_and_not_learned_from(engine, normalise, fault, words):
     agent = tightrope.PPO(
-        lambda: Faulty(fault), engine=engine, normalise_observations=normalise, vector_backend="serial", **SMALL
+        lambda: Faulty(fault),
+        engine=engine,
+        normalise_observations=normalise,
+        vector_backend="serial",
+        **SMALL,
     )
     before = parameters(agent)
     with pytest.raises(BadNumbers, match=words):

@@ -9,10 +9,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, Self, get_args
 
 Schedule = Literal["constant", "linear", "cosine"]
-T = TypeVar("T")
 
 
 def setting(
@@ -126,22 +125,23 @@ class UpdateSettings:
         """Check every field against its range."""
         check_ranges(self)
 
-    def at(self: T, progress: float) -> T:
+    def at(self, progress: float) -> Self:
         """The settings in force at ``progress`` in [0, 1]: each scheduled number at its present value."""
-        names = [f.name for f in dataclasses.fields(self) if f.name.endswith("_schedule")]  # type: ignore[arg-type]
-        values: dict[str, Any] = {}
-        for name in names:
-            base = name.removesuffix("_schedule")
-            values[base] = scheduled(getattr(self, base), getattr(self, name), progress)
-        if "learning_rate" in values:
-            critic = self.critic_learning_rate  # type: ignore[attr-defined]
-            values["critic_learning_rate"] = scheduled(critic, self.learning_rate_schedule, progress)  # type: ignore[attr-defined]
-        present = object.__new__(
-            type(self)
-        )  # a rate of exactly 0 at the end is legal here, not as a user's input
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            object.__setattr__(present, field.name, values.get(field.name, getattr(self, field.name)))
-        return present
+        names = [f.name for f in dataclasses.fields(self) if f.name.endswith("_schedule")]
+        bases = {name.removesuffix("_schedule"): getattr(self, name) for name in names}
+        bases["critic_learning_rate"] = self.learning_rate_schedule
+        return self.unchecked(
+            **{base: scheduled(getattr(self, base), schedule, progress) for base, schedule in bases.items()}
+        )
+
+    def unchecked(self, **values: Any) -> Self:
+        """A copy with these values, not checked: what is in force may lie at the edge of what a user may
+        ask.
+        """
+        copy = object.__new__(type(self))
+        for field in dataclasses.fields(self):
+            object.__setattr__(copy, field.name, values.get(field.name, getattr(self, field.name)))
+        return copy
 
 
 @dataclass(frozen=True, kw_only=True)

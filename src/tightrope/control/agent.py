@@ -80,18 +80,9 @@ class Agent:
         self.sampling_rng, self.update_rng = (np.random.default_rng([present.seed, k]) for k in (1, 2))
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
         self.steps, self.kl_beta = 0, getattr(present.update, "kl_beta", None)
-        self._fresh, self.engine_check = True, ""
-        backend = (
-            self.environments.backend if self.environments.backend != "given" else present.vector_backend
-        )
-        self.settings = dataclasses.replace(
-            present,
-            num_envs=self.environments.num_envs,
-            vector_backend=backend,
-            num_workers=self.environments.num_workers if backend == "workers" else present.num_workers,
-            engine=self.engine.name,
-            threads=present.threads or (self.cores if layouts[0].image_shapes else 1),
-        )
+        self._fresh, self.notify = True, notify
+        threads = present.threads or (self.cores if layouts[0].image_shapes else 1)
+        self.settings = _resolved(present, self.environments, self.engine.name, threads)
 
     # ---------------------------------------------------------------------------------------------- learning
 
@@ -133,7 +124,7 @@ class Agent:
         """collect -> advantages -> update -> statistics."""
         present = self.settings.update.at(progress)
         if isinstance(present, PPOSettings) and self.kl_beta is not None:
-            present = _with(present, kl_beta=self.kl_beta)
+            present = present.unchecked(kl_beta=self.kl_beta)
         set_learning_rates(self.optimiser, present)
         begin = time.perf_counter()
         rollout = self.collector.collect(self.engine, columns)
@@ -141,8 +132,8 @@ class Agent:
         batch = to_batch(rollout, self.engine, self.normalisers, present)
         metrics: dict[str, float] = {}
         if bool(batch.mask.any()):
-            if check:
-                self.engine_check = self.engine.check(batch, present)
+            if check and (line := self.engine.check(batch, present)):
+                self.notify(line)
             metrics = self.engine.update(
                 self.optimiser,
                 batch,
@@ -229,10 +220,12 @@ class Agent:
     # saving
 
     def set_env(self, env: Any) -> Agent:
-        """Go on learning on another environment with the same spaces (a warm start)."""
-        self.environments.close()
-        fresh = _environments(env, self.settings)
-        old = self.environments
+        """Go on learning on another environment with the same spaces (a warm start).
+
+        Raises ValueError, with nothing changed, when the spaces differ.
+        """
+        free = anywhere(self.settings)
+        fresh, old = _environments(env, free), self.environments
         for name in ("observation_layout", "action_layout"):
             seen, expected = getattr(fresh, name).space, getattr(old, name).space
             if seen != expected:
@@ -240,12 +233,13 @@ class Agent:
                 raise ValueError(
                     f"The new environment has {name[:-7]}s {seen}; this policy was made for {expected}."
                 )
-        self.env, self.environments = env, fresh
+        old.close()
+        self.env, self.environments, self._fresh = env, fresh, True
         if self.normalisers.rewards is not None:
             self.normalisers.rewards.restart(fresh.num_envs)
         self.collector = Collector(fresh, self.normalisers, self.sampling_rng)
-        self.settings = dataclasses.replace(self.settings, env=fresh.spec_id, num_envs=fresh.num_envs)
-        self._fresh = True
+        named = dataclasses.replace(free, env=fresh.spec_id)
+        self.settings = _resolved(named, fresh, self.engine.name, free.threads)
         return self
 
     def save(self, path: str | Path) -> Path:
@@ -282,6 +276,26 @@ class Reinforce(Agent):
 AGENTS: dict[str, type[Agent]] = {"ppo": PPO, "a2c": A2C, "reinforce": Reinforce}
 
 
+def anywhere(settings: TrainSettings) -> TrainSettings:
+    """The same settings with the choice of who steps the environments open again: for another environment."""
+    return dataclasses.replace(settings, vector_backend="auto", num_workers=None)
+
+
+def _resolved(
+    settings: TrainSettings, environments: Environments, engine: str, threads: int | None
+) -> TrainSettings:
+    """The settings with everything filled in that was left to choose: what settings.json holds."""
+    given, workers = environments.backend == "given", environments.backend == "workers"
+    return dataclasses.replace(
+        settings,
+        num_envs=environments.num_envs,
+        vector_backend="auto" if given else environments.backend,
+        num_workers=environments.num_workers if workers else None,
+        engine=engine,
+        threads=threads,
+    )
+
+
 def _environments(env: Any, settings: TrainSettings) -> Environments:
     source = settings.env if env is None else env
     backend, workers = settings.vector_backend, settings.num_workers
@@ -307,14 +321,6 @@ def _is_batched(layout: ObservationLayout, observation: Any) -> bool:
     for key in leaf.path:
         observation = observation[key]
     return np.ndim(observation) > len(leaf.space.shape or ())
-
-
-def _with(settings: Any, **values: Any) -> Any:
-    """A copy with these values that is not checked again: present values may lie at the edge of a range."""
-    copy = object.__new__(type(settings))
-    for field in dataclasses.fields(settings):
-        object.__setattr__(copy, field.name, values.get(field.name, getattr(settings, field.name)))
-    return copy
 
 
 def _settings_metrics(present: Any) -> dict[str, float]:

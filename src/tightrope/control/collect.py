@@ -149,8 +149,10 @@ class Collector:
         """Raise BadNumbers naming environment, step and index of the first NaN or infinity, if there is
         one.
         """
-        where = rollout.raw[:, :num_steps]
-        checks = [("observation", where), ("reward", rollout.rewards[:, :num_steps, None])]
+        checks = [
+            ("observation", rollout.raw[:, :num_steps]),
+            ("reward", rollout.rewards[:, :num_steps, None]),
+        ]
         checks += [("observation", x["flat"][:, None]) for x in [self._inputs] if "flat" in x]
         checks += [("final observation", x["flat"][:, None]) for _, _, x in rollout.finals if "flat" in x]
         for what, numbers in checks:
@@ -158,9 +160,10 @@ class Collector:
             if good.all():
                 continue
             row, t, index = np.argwhere(~good)[0]
+            where = f"step {self._step_count + t}" + ("" if what == "reward" else f", index {index}")
             raise BadNumbers(
-                f"Environment {row} of {self.environments.spec_id} returned {what} = {numbers[row, t, index]} at step "
-                f"{self._step_count + t}{f', index {index}' if what != 'reward' else ''}; expected finite "
+                f"Environment {row} of {self.environments.spec_id} returned "
+                f"{what} = {numbers[row, t, index]} at {where}; expected finite "
                 "numbers. The policy was not updated with it. Mend the environment, or clip and check its "
                 "state there."
             )

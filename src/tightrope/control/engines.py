@@ -172,7 +172,7 @@ class CompiledEngine:
                 f"parameter (limit {CHECK_LIMIT:g}). Train with --engine torch, and please report this with "
                 "your settings.json."
             )
-        return f"engine check: one minibatch by ppo.py and compiled, largest difference of a parameter {difference:.1e}"
+        return f"engine check: one minibatch by ppo.py and compiled, largest difference {difference:.1e}"
 
 
 def choose(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ def mlp(
     ones.
     """
     layers: list[nn.Module] = []
-    for i, (n_in, n_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for i, (n_in, n_out) in enumerate(pairwise(sizes)):
         final = last_gain is not None and i == len(sizes) - 2
         layers.append(_orthogonal(nn.Linear(n_in, n_out), last_gain if final else math.sqrt(2.0), generator))
         if not final:

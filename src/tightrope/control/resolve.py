@@ -31,8 +31,7 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
         chosen["minibatch_size"] = min(chosen["minibatch_size"], steps)
     elif algorithm == "ppo" and "minibatch_size" not in values:
         chosen["minibatch_size"] = min(64, steps)
-    base = TrainSettings(env=env_id, algorithm=algorithm, update=ALGORITHM_SETTINGS[algorithm]())  # type: ignore[arg-type]
-    return base.with_values(**{**chosen, **values})
+    return TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
 
 
 def _name_of(env: Any) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.agent import AGENTS, Agent, anywhere
 from tightrope.control.settings import settings_from_json, settings_to_json
 from tightrope.runs import checkpoint
 
@@ -56,8 +56,12 @@ def load(
             f"{path} was trained on {settings.env!r}, which no file may import. Pass it again: "
             f"load({str(path)!r}, env=...), or on the command line --env-module FILE.py."
         )
-    if isinstance(env, str):
-        settings = dataclasses.replace(settings, env=env, vector_backend="auto", num_workers=None)
+    if env is not None:
+        name, rows = (
+            env if isinstance(env, str) else settings.env,
+            getattr(env, "num_envs", settings.num_envs),
+        )
+        settings = dataclasses.replace(anywhere(settings), env=name, num_envs=rows)
     agent = AGENTS[settings.algorithm](
         env if env is not None else settings.env, policy=policy, settings=settings
     )

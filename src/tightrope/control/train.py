@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
@@ -89,48 +90,27 @@ def _continue(
     agent: Agent, run: Run, total_steps: int, report: Reporter, *, best: float, wall: float
 ) -> dict[str, Any]:
     """The loop: update -> record -> evaluate -> save, until the budget is spent."""
-    settings = agent.settings
+    settings, begin, wall_before = agent.settings, agent.steps, wall
     evaluator = _Evaluator(agent, run, report, best)
-    lines = [
-        agent.engine_line,
-        f"environments: {agent.environments.num_envs} x {settings.env}, {agent.environments.backend}",
-    ]
-    start = {
-        "settings": settings_to_json(settings),
-        "run_dir": str(run.path),
-        "lines": lines,
-        "step": agent.steps,
-    }
-    report("start", start)
-    evaluate_at = _grid(settings.evaluate_every, total_steps, agent.steps)
-    save_at = _grid(settings.checkpoint_every, total_steps, agent.steps)
-    updates, interrupt = agent.iterate(total_steps, start=0), Interrupt()
-    begin_steps, first_wall, first_line_said = agent.steps, wall, False
+    report("start", _start(agent, run))
+    evaluate_at = _Grid(settings.evaluate_every, total_steps, begin)
+    save_at = _Grid(settings.checkpoint_every, total_steps, begin)
     try:
         clock = time.perf_counter()
-        for progress in interrupt.between(updates):
+        for progress in Interrupt().between(agent.iterate(total_steps, start=0)):
             wall += time.perf_counter() - clock
-            if agent.engine_check and not first_line_said:
-                report("line", {"text": agent.engine_check})
-                first_line_said = True
-            metrics = dict(progress.metrics)
+            step, metrics = agent.steps, {**progress.metrics, "time/seconds": wall}
+            if evaluate_at.due(step):
+                metrics |= evaluator.evaluate()
             run.record_episodes(
-                {"step": agent.steps, "return": r, "length": n, "terminated": t}
-                for r, n, t in progress.episodes
+                {"step": step, "return": r, "length": n, "terminated": t} for r, n, t in progress.episodes
             )
-            if evaluate_at and agent.steps >= evaluate_at[0]:
-                evaluate_at = [step for step in evaluate_at if step > agent.steps]
-                metrics |= evaluator.evaluate(wall)
-            run.record(agent.steps, wall, metrics)
-            report(
-                "update",
-                {"step": agent.steps, "total_steps": total_steps, "metrics": metrics, "seconds": wall},
-            )
-            if save_at and agent.steps >= save_at[0]:
-                save_at = [step for step in save_at if step > agent.steps]
+            run.record(step, wall, metrics)
+            report("update", {"step": step, "total_steps": total_steps, "metrics": metrics, "seconds": wall})
+            if save_at.due(step):
                 _save(agent, run, evaluator.best, wall)
             clock = time.perf_counter()
-        final = evaluator.evaluate(wall) if settings.evaluate_every is not None else {}
+        final = evaluator.evaluate()
         _save(agent, run, evaluator.best, wall)
     except KeyboardInterrupt:
         _save(agent, run, evaluator.best, wall)
@@ -139,21 +119,31 @@ def _continue(
         evaluator.close()
         agent.close()
         run.close()
-    summary = {
-        "env": settings.env,
-        "algorithm": settings.algorithm,
-        "seed": settings.seed,
-        "steps": agent.steps,
-        "wall_seconds": wall,
-        "steps_per_second": (agent.steps - begin_steps) / max(wall - first_wall, 1e-9),
-        "final": final,
-        "best_mean_reward": evaluator.best if evaluator.best > float("-inf") else None,
-        "engine": settings.engine,
-        "run_dir": str(run.path),
-    }
+    summary = _summary(agent, run, wall, (agent.steps - begin) / max(wall - wall_before, 1e-9))
+    summary |= {"final": final, "best_mean_reward": evaluator.best if math.isfinite(evaluator.best) else None}
     run.finish(summary)
     report("finish", summary)
     return summary
+
+
+def _start(agent: Agent, run: Run) -> dict[str, Any]:
+    settings, environments = agent.settings, agent.environments
+    workers = f" in {environments.num_workers} processes" if environments.backend == "workers" else ""
+    who = f"environments: {environments.num_envs} x {settings.env}, {environments.backend}{workers}"
+    lines = [agent.engine_line, who]
+    return {
+        "settings": settings_to_json(settings),
+        "run_dir": str(run.path),
+        "lines": lines,
+        "step": agent.steps,
+    }
+
+
+def _summary(agent: Agent, run: Run, wall: float, rate: float) -> dict[str, Any]:
+    settings = agent.settings
+    names = ("env", "algorithm", "seed", "engine")
+    numbers = {"steps": agent.steps, "wall_seconds": wall, "steps_per_second": rate}
+    return {**{name: getattr(settings, name) for name in names}, **numbers, "run_dir": str(run.path)}
 
 
 class Interrupt:
@@ -200,7 +190,7 @@ class _Evaluator:
         except ValueError as error:
             report("line", {"text": f"no evaluation while training: {error}"})
 
-    def evaluate(self, wall: float) -> dict[str, float]:
+    def evaluate(self) -> dict[str, float]:
         if self.environments is None:
             return {}
         result = evaluate_agent(self.agent, self.environments, self.agent.settings.evaluation_episodes)
@@ -221,14 +211,19 @@ class _Evaluator:
             self.environments.close()
 
 
-def _grid(fraction: float | None, total_steps: int, past: int) -> list[int]:
-    """Steps at which something is due: multiples of the fraction of the run, those still ahead, the end left
-    out.
-    """
-    if fraction is None:
-        return []
-    points = [round(total_steps * fraction * k) for k in range(1, int(1.0 / fraction) + 1)]
-    return [point for point in points if past < point < total_steps]
+class _Grid:
+    """Steps at which something is due: multiples of a fraction of the run, the end left out."""
+
+    def __init__(self, fraction: float | None, total_steps: int, past: int) -> None:
+        count = 0 if fraction is None else int(1.0 / fraction)
+        points = [round(total_steps * (fraction or 0.0) * k) for k in range(1, count + 1)]
+        self.ahead = [point for point in points if past < point < total_steps]
+
+    def due(self, step: int) -> bool:
+        """Whether a point has been reached; several passed at once count as one."""
+        reached = bool(self.ahead) and step >= self.ahead[0]
+        self.ahead = [point for point in self.ahead if point > step]
+        return reached
 
 
 def _save(agent: Agent, run: Run, best: float, wall: float) -> None:

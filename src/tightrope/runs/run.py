@@ -105,7 +105,8 @@ class Run:
         if not text:
             return
         if name not in self._files:
-            self._files[name] = open(self.path / name, "a", encoding="utf-8")  # noqa: SIM115 - closed in close()
+            file = open(self.path / name, "a", encoding="utf-8")  # noqa: SIM115 - closed in close()
+            self._files[name] = file
         self._files[name].write(text)
         self._files[name].flush()
 

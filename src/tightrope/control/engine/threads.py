@@ -1,9 +1,8 @@
 """Two threads in one minibatch: each owns half of the parameters, and they meet at the joint gradient norm.
 
 A meeting is a counter per thread, written with release and read with acquire. A thread that waits spins for
-a while
-and then gives its core away; it stops waiting when the other has left. Nothing here can change a bit of the
-result.
+a while and then gives its core away; it stops waiting when the other has left. Nothing here can change a bit
+of the result.
 """
 
 # mypy: ignore-errors

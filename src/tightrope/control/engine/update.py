@@ -263,6 +263,16 @@ def publish(role, exchange, flat, grad, options, ledgers, count):
         exchange[k * LEDGER + SQUARES], exchange[k * LEDGER + HALT] = squares(flat, grad, begin, end), halt
 
 
+@glue
+def keep_books(role, ledgers, start):
+    """Note where this minibatch begins, and copy the books as they stand: they go back if the other thread leaves."""
+    for k in range(2):
+        if role & (k + 1):
+            ledgers[k, AT] = start
+            for j in range(LEDGER):
+                ledgers[2 + k, j] = ledgers[k, j]
+
+
 @entry(
     "int64(int64, int64, int64, int64, int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1],"
     "float32[::1], float32[::1], float32[::1], float32[:,::1], boolean[:,::1], float32[:,::1], float32[::1],"
@@ -278,8 +288,7 @@ def train(
     ``begin`` on.
 
     Returns RUNNING, or why it stopped before a step: STOPPED (KL), NOT_FINITE, MISMATCH, ALONE (the other
-    thread left;
-    ``ledgers[2:]`` are the books before that minibatch). ``ledgers[., AT]`` is that minibatch's first row.
+    thread left; ``ledgers[2:]`` are the books before that minibatch). ``ledgers[., AT]`` is that minibatch's first row.
     """
     data = (inputs, masks, actions, old_logp, old_values, advantages, returns)
     rows, size = len(order), int(options[MINIBATCH])
@@ -290,15 +299,10 @@ def train(
             store_shared(control, EPOCH, now + 1)
         for start in range(begin, rows, size):
             end = start + size if start + size < rows else rows
-            parity = (
-                control[ARRIVED + LINE * (role == CRITIC)] & 1
-            )  # the other may still be reading the last one
+            # the other may still be reading the last exchange: two take turns
+            parity = control[ARRIVED + LINE * (role == CRITIC)] & 1
             own = row(exchange, parity * 2 * LEDGER, 2 * LEDGER)
-            for k in range(2):
-                if role & (k + 1):
-                    ledgers[k, AT] = start
-                    for j in range(LEDGER):
-                        ledgers[2 + k, j] = ledgers[k, j]
+            keep_books(role, ledgers, start)
             gradients(
                 role, places, layers, heads, flat, grad, work, data, order, start, end, options, ledgers
             )
