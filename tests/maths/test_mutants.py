@@ -150,8 +150,8 @@ MUTANTS = (
     Mutant(
         "explained variance divides by the wrong one",
         "values.py",
-        "total = masked_variance(returns.double(), mask)",
-        "total = masked_variance(values.double(), mask)",
+        "kept.var(correction=0), (kept",
+        "values[mask].double().var(correction=0), (kept",
     ),
     Mutant("k1 has the other sign", "divergence.py", "return -log_ratio", "return log_ratio"),
     Mutant(

@@ -91,6 +91,8 @@ class ActionLayout:
         """
         if squash:
             actions = self.squashed(actions)
+        if len(self.leaves) == 1 and self.leaves[0].path == ():
+            return self.leaves[0].to_env(actions)
         return nest(self.space, (leaf.to_env(actions) for leaf in self.leaves))
 
     def to_env_single(self, actions: np.ndarray, squash: bool = False) -> Any:

@@ -37,8 +37,9 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
     },
     "MountainCarContinuous-v0": {
         "num_envs": 8,
-        "num_steps": 128,
+        "num_steps": 256,
         "std": "gsde",
+        "gsde_steps": 256,
         "normalise_observations": True,
         "normalise_rewards": True,
         "total_steps": 100_000,
@@ -46,8 +47,10 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
     "Pendulum-v1": {
         "num_envs": 8,
         "num_steps": 256,
-        "gamma": 0.9,
+        "gamma": 0.95,
         "learning_rate": 1e-3,
+        "activation": "relu",
+        "normalise_rewards": True,
         "total_steps": 200_000,
     },
     "LunarLander-v3": {
@@ -69,13 +72,19 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "gae_lambda": 0.98,
         "total_steps": 1_000_000,
     },
-    "HalfCheetah-v5": {**_MUJOCO, "total_steps": 1_000_000},
+    "HalfCheetah-v5": {**_MUJOCO, "log_std_init": -1.0, "total_steps": 1_000_000},
     "Hopper-v5": {**_MUJOCO, "total_steps": 1_000_000},
     "Walker2d-v5": {**_MUJOCO, "total_steps": 1_000_000},
 }
 
 A2C_PRESETS: dict[str, dict[str, Any]] = {
-    "CartPole-v1": {"num_envs": 8, "num_steps": 16, "learning_rate": 1e-3, "total_steps": 300_000},
+    "CartPole-v1": {
+        "num_envs": 8,
+        "num_steps": 16,
+        "learning_rate": 1e-3,
+        "normalise_rewards": True,
+        "total_steps": 300_000,
+    },
 }
 
 REINFORCE_PRESETS: dict[str, dict[str, Any]] = {
@@ -83,7 +92,7 @@ REINFORCE_PRESETS: dict[str, dict[str, Any]] = {
 }
 
 BY_TASK = {"ppo": PPO_PRESETS, "a2c": A2C_PRESETS, "reinforce": REINFORCE_PRESETS}
-A2C_DEFAULT = {"num_steps": 16, "learning_rate": 7e-4}
+A2C_DEFAULT = {"num_steps": 16, "learning_rate": 7e-4, "normalise_rewards": True}
 
 
 def preset(

@@ -40,16 +40,14 @@ class ApiBreak(Exception):
 
 
 class Step(NamedTuple):
-    """What one step of all B copies gave. The arrays are the caller's own."""
+    """What one step of all B copies gave; rewards and flags are good until the next step."""
 
     inputs: Inputs  # what the next action is chosen from
     action_mask: np.ndarray | None  # bool [B, L], for the next action
     rewards: np.ndarray  # float64 [B]
     terminated: np.ndarray  # bool [B]
     truncated: np.ndarray  # bool [B]; never True where terminated is
-    phantom: (
-        np.ndarray | None
-    )  # bool [B]: only the reset that NEXT_STEP does; no transition, the action was ignored
+    phantom: np.ndarray | None  # bool [B]: NEXT_STEP's reset, no transition; None: there is none in this step
     final_rows: np.ndarray | None  # int [F]: truncated rows whose ``inputs`` are the next episode's already
     final_inputs: Inputs | None  # [F, ...]: the true last observations of these rows
 

@@ -43,7 +43,9 @@ def explained_variance(values: Tensor, returns: Tensor, mask: Tensor) -> Tensor:
     ValueError when the shapes differ.
     """
     require_same_shape(values=values, returns=returns, mask=mask)
-    total = masked_variance(returns.double(), mask)
-    residual = masked_variance(returns.double() - values.double(), mask)
+    kept = returns[mask].double()
+    if not kept.numel():
+        return values.new_zeros(())
+    total, residual = kept.var(correction=0), (kept - values[mask].double()).var(correction=0)
     known = total > 0
     return torch.where(known, 1 - residual / torch.where(known, total, 1.0), 0.0).to(values.dtype)

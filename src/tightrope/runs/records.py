@@ -32,6 +32,10 @@ def plain(value: Any) -> Any:
 
 def dumps(value: Any, indent: int | None = None) -> str:
     """One JSON text without NaN literals; on a single line unless ``indent`` is given."""
+    try:
+        return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=False)
+    except (TypeError, ValueError):  # numbers of numpy or torch, paths, floats that are not finite
+        pass
     return json.dumps(plain(value), allow_nan=False, indent=indent, ensure_ascii=False)
 
 

@@ -265,7 +265,9 @@ def publish(role, exchange, flat, grad, options, ledgers, count):
 
 @glue
 def keep_books(role, ledgers, start):
-    """Note where this minibatch begins, and copy the books as they stand: they go back if the other thread leaves."""
+    """Note where this minibatch begins, and copy the books as they stand: they go back if the other thread
+    leaves.
+    """
     for k in range(2):
         if role & (k + 1):
             ledgers[k, AT] = start
@@ -288,7 +290,8 @@ def train(
     ``begin`` on.
 
     Returns RUNNING, or why it stopped before a step: STOPPED (KL), NOT_FINITE, MISMATCH, ALONE (the other
-    thread left; ``ledgers[2:]`` are the books before that minibatch). ``ledgers[., AT]`` is that minibatch's first row.
+    thread left; ``ledgers[2:]`` are the books before that minibatch). ``ledgers[., AT]`` is that minibatch's
+    first row.
     """
     data = (inputs, masks, actions, old_logp, old_values, advantages, returns)
     rows, size = len(order), int(options[MINIBATCH])
