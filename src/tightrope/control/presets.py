@@ -74,7 +74,7 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
     },
     "HalfCheetah-v5": {**_MUJOCO, "log_std_init": -1.0, "total_steps": 1_000_000},
     "Hopper-v5": {**_MUJOCO, "total_steps": 1_000_000},
-    "Walker2d-v5": {**_MUJOCO, "total_steps": 1_000_000},
+    "Walker2d-v5": {**_MUJOCO, "log_std_init": -1.0, "total_steps": 1_000_000},
 }
 
 A2C_PRESETS: dict[str, dict[str, Any]] = {
@@ -112,7 +112,7 @@ def preset(
         values |= {"num_epochs": 4, "minibatch_size": 256, "clip": 0.1} if algorithm == "ppo" else {}
         return values
     if kind == "continuous":
-        values |= {"normalise_observations": True, "normalise_rewards": True}
+        values |= {"normalise_observations": True, "normalise_rewards": True, "log_std_init": -0.5}
     if algorithm == "a2c":
         values |= A2C_DEFAULT
     if algorithm == "reinforce":  # whole episodes must fit: several time limits per rollout

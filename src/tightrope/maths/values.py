@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from .shapes import require_same_shape
-from .statistics import masked_variance
 
 
 def squared_error(values: Tensor, returns: Tensor, mask: Tensor | None = None) -> Tensor:
