@@ -1,9 +1,63 @@
-"""Where compiled code is kept, and when the second thread helps."""
+"""Where compiled code is kept, how it comes back, and when the second thread helps."""
 
+import hashlib
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from tightrope.control.engine import compiled
+import tightrope
+from tightrope.control.engine import cache, compiled
 from tightrope.control.engine.threads import Pace
+
+COMPILER = ("numba.np.linalg", "numba.np.arrayobj", "numba.np.random.generator_core", "numba.cpython.unicode")
+START = """
+import sys
+import numpy as np
+import torch
+
+def memory():
+    status = open("/proc/self/status").read() if sys.platform == "linux" else "VmHWM: 0 kB"
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+before = memory()
+from tightrope.control.engine import fused, infer
+x = np.arange(12, dtype=np.float32).reshape(3, 4)
+no, yes, out = np.zeros(x.shape, bool), np.ones(x.shape, bool), np.empty_like(x)
+infer.gae(x, x + 1, x + 2, no, no, yes, 0.99, 0.95, out)
+print(out.tobytes().hex(), memory() - before, *sorted(sys.modules))
+"""
+
+
+def start(caches):
+    """What a process that makes the engine from this cache computes, the memory it needed, and its
+    modules."""
+    source = str(Path(tightrope.__file__).parents[1])
+    environment = {**os.environ, "XDG_CACHE_HOME": str(caches), "PYTHONPATH": source}
+    run = subprocess.run(
+        [sys.executable, "-c", START], env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    bits, memory, *modules = run.stdout.split()
+    return bits, float(memory), modules
+
+
+@pytest.fixture
+def warm(tmp_path):
+    """A cache directory with a copy of all that is compiled."""
+    from tightrope.control.engine import fused  # noqa: F401  (compiles what is not there yet)
+
+    folder = compiled.cache_folder()
+    if folder is None or compiled.compilation_due():
+        pytest.skip("the cache is switched off")
+    shutil.copytree(folder, tmp_path / "tightrope" / "numba" / folder.name)
+    return tmp_path / "tightrope" / "numba" / folder.name
 
 
 def test_cache_lies_in_the_users_cache_directory_and_is_private(tmp_path, monkeypatch):
@@ -29,6 +83,74 @@ def test_numbas_own_setting_is_left_alone():
     import numba
 
     assert "tightrope" not in str(numba.config.CACHE_DIR)
+
+
+def test_a_warm_start_needs_no_compiler_and_little_memory(warm):
+    _, memory, modules = start(warm.parents[2])
+    assert "tightrope.control.engine.update" in modules
+    assert not [name for name in (*COMPILER, "scipy.linalg") if name in modules]
+    assert memory < 130  # MB; about 85, and 50 more with all that numba needs for a compilation
+
+
+def test_damaged_and_foreign_entries_are_compiled_again(warm):
+    expected, _, _ = start(warm.parents[2])
+    entry, other = (warm / f"tightrope.control.engine.infer.{name}" for name in ("gae", "values"))
+    sound, data = entry.read_bytes(), bytearray(entry.read_bytes())
+    data[len(data) // 2] ^= 1
+    entry.write_bytes(data)
+    foreign = pickle.dumps(("another", "program"))
+    other.write_bytes(hashlib.sha256(foreign).digest() + foreign)
+    bits, _, modules = start(warm.parents[2])
+    assert bits == expected and set(COMPILER) <= set(modules)
+    assert len(entry.read_bytes()) > len(sound) // 2 and entry.read_bytes() != data
+    assert entry.stat().st_mode & 0o777 == 0o600
+    bits, _, modules = start(warm.parents[2])  # they have been replaced
+    assert bits == expected and not set(COMPILER) & set(modules)
+    assert not list(warm.glob("tmp*"))
+
+
+@pytest.mark.parametrize("content", [b"", b"x", b"x" * 100])
+def test_what_is_no_entry_is_not_loaded(content, tmp_path):
+    def function():
+        pass
+
+    cache._file(tmp_path, function).write_bytes(content)
+    assert cache.load(tmp_path, function, lambda f: f) is None
+
+
+def test_folders_long_out_of_use_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(compiled.SWITCH, raising=False)
+    root = compiled.cache_folder().parent
+    ages = {"0" * 16: 100, "1" * 16: 80, "not-ours": 100, "2" * 16: 100}
+    for name, days in ages.items():
+        (root / name / "below").mkdir(parents=True)
+        if name != "2" * 16:
+            (root / name / "complete").touch()
+            os.utime(root / name / "complete", (time.time() - days * 86400,) * 2)
+    os.utime(root / ("2" * 16), (time.time() - 100 * 86400,) * 2)
+    compiled.mark_complete()
+    assert {path.name for path in root.iterdir()} - {compiled.cache_folder().name} == {"1" * 16, "not-ours"}
+
+
+def test_scipys_linear_algebra_is_whole_after_its_blas_was_taken_alone():
+    code = (
+        "import tightrope.control.engine.compiled, scipy.linalg, scipy.linalg.cython_blas as b, numpy\n"
+        "from scipy.linalg import cython_blas as c\n"
+        "from numba.extending import get_cython_function_address as address\n"
+        "assert b is c and address('scipy.linalg.cython_blas', 'dgemm')\n"
+        "assert numpy.allclose(scipy.linalg.solve([[2.0, 1], [1, 3]], [3, 4]), 1)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(tightrope.__file__).parents[1])}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+def test_wrong_arguments_are_refused():
+    from tightrope.control.engine import infer
+
+    with pytest.raises(TypeError, match="No matching definition"):
+        infer.values(np.zeros(3), 1, 2, 3, 4, 5)
 
 
 def test_pace_takes_the_quicker_way_and_tries_the_other_again():

@@ -1,5 +1,4 @@
-"""How the engine's functions are compiled: flags, cache folder, and the few instructions numba has no words
-for.
+"""How the engine's functions are compiled: flags, and the few instructions numba has no words for.
 
 Never ``fastmath=True``: it promises the compiler that no NaN exists and makes every isnan and isfinite
 false. ``reassoc`` alone already turns x - x into 0, and np.isfinite, which numba builds on it, into True:
@@ -12,25 +11,26 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import hashlib
-import os
+import importlib.machinery
+import importlib.util
 import platform
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import llvmlite
 import llvmlite.binding as llvm
 import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils, codegen
 from numba.extending import get_cython_function_address, intrinsic
-from numba.np import arrayobj
+
+from tightrope.control.engine.cache import SWITCH, cache_folder, compilation_due, load, mark_complete, store
+
+__all__ = ["SWITCH", "cache_folder", "compilation_due", "mark_complete"]  # and what is defined here
 
 FLAGS = {"contract", "reassoc", "arcp", "nsz", "afn"}
-SWITCH = "TIGHTROPE_NUMBA_CACHE"
 
 OPTIONS = {
     "nogil": True,
@@ -60,53 +60,29 @@ def element(function: Any) -> Any:
     return numba.njit(fastmath={"contract"}, forceinline=True, no_cpython_wrapper=True, **OPTIONS)(function)
 
 
-llvm.add_symbol("tightrope_sgemm", get_cython_function_address("scipy.linalg.cython_blas", "sgemm"))
+def _sgemm_address() -> int:
+    """Where scipy's sgemm lies: its module is loaded alone, as all of scipy.linalg is 11 MB and a quarter of
+    a second. Later imports of scipy.linalg take over this module."""
+    name = "scipy.linalg.cython_blas"
+    if "scipy.linalg" not in sys.modules:
+        with contextlib.suppress(Exception):
+            import scipy
+
+            folder = str(Path(scipy.__file__).parent / "linalg")
+            found = importlib.machinery.PathFinder.find_spec(name, [folder])
+            module = importlib.util.module_from_spec(found)
+            found.loader.exec_module(module)
+            capsule = ctypes.py_object(module.__pyx_capi__["sgemm"])
+            get_name, get_pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
+            get_name.restype, get_pointer.restype = ctypes.c_void_p, ctypes.c_void_p
+            return get_pointer(capsule, ctypes.c_void_p(get_name(capsule)))
+    return get_cython_function_address(name, "sgemm")
+
+
+llvm.add_symbol("tightrope_sgemm", _sgemm_address())
 _LIBRARY = ctypes.WinDLL("kernel32") if sys.platform == "win32" else ctypes.CDLL(None)
 _YIELD = _LIBRARY.SwitchToThread if sys.platform == "win32" else _LIBRARY.sched_yield
 llvm.add_symbol("tightrope_yield", ctypes.cast(_YIELD, ctypes.c_void_p).value)
-
-
-def cache_folder() -> Path | None:
-    """Where compiled code is kept, 0700 below the user's cache directory; None when switched off or not safe.
-
-    The name of the last folder stands for everything the machine code depends on: these sources, numba, the
-    CPU.
-    """
-    if os.environ.get(SWITCH, "").lower() in ("off", "0", "no", "none"):
-        return None
-    state = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        state.update(source.read_bytes())
-    machine = (llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), platform.machine())
-    state.update(repr((numba.__version__, llvmlite.__version__, sys.version, machine)).encode())
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    root = base / "tightrope" / "numba"
-    folder = root / state.hexdigest()[:16]
-    try:
-        base.mkdir(parents=True, exist_ok=True)
-        for part in (base / "tightrope", root, folder):
-            part.mkdir(mode=0o700, exist_ok=True)
-        for part in (root, folder):
-            if hasattr(os, "getuid") and part.stat().st_uid != os.getuid():
-                return None  # what lies there was not written by this user and would be executed
-            part.chmod(0o700)
-    except OSError:
-        return None
-    return folder if os.access(folder, os.W_OK) else None
-
-
-def compilation_due() -> bool:
-    """Whether loading the engine will compile it (many seconds) and not read it from the cache (under
-    one)."""
-    folder = cache_folder()
-    return folder is None or not (folder / "complete").exists()
-
-
-def mark_complete() -> None:
-    """Note in the cache that everything has been compiled."""
-    folder = cache_folder()
-    if folder is not None:
-        (folder / "complete").touch(mode=0o600)
 
 
 @contextlib.contextmanager
@@ -133,21 +109,21 @@ def _late_optimisation() -> Iterator[None]:
 
 
 def entry(signature: str) -> Callable[[Any], Any]:
-    """Compile a function that Python calls, with this signature alone, now or from the cache."""
-    folder = cache_folder()
+    """A function that Python calls, with this signature alone: from the cache, or else compiled now."""
+    options = {"fastmath": FLAGS, **OPTIONS}
 
-    def compile_now(function: Any) -> Any:
-        earlier = numba.config.CACHE_DIR
-        numba.config.CACHE_DIR = (
-            "" if folder is None else str(folder)
-        )  # read when the cache of a function is made
-        try:
-            with _late_optimisation():
-                return numba.njit(signature, cache=folder is not None, fastmath=FLAGS, **OPTIONS)(function)
-        finally:
-            numba.config.CACHE_DIR = earlier
+    def load_or_compile(function: Any) -> Any:
+        folder = cache_folder()
+        found = None if folder is None else load(folder, function, numba.njit(**options))
+        if found is not None:
+            return found
+        with _late_optimisation():
+            made = numba.njit(signature, **options)(function)
+        if folder is not None:
+            store(folder, function, made)
+        return made
 
-    return compile_now
+    return load_or_compile
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, offset: Any) -> Any:
@@ -171,6 +147,8 @@ def row(typing: Any, array: Any, offset: Any, count: Any) -> Any:
     kind = types.Array(array.dtype, 1, "C")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        from numba.np import arrayobj  # part of the compiler, which a start from the cache does without
+
         array, offset, count = arguments
         view = context.make_array(kind)(context, builder)
         size = context.get_constant(types.intp, 4 if signature.args[0].dtype == types.float32 else 8)
