@@ -36,7 +36,11 @@ class TorchEngine:
         self.gsde_steps = settings.gsde_steps
         self.device = policy.device
         mode = "reduce-overhead" if self.device.type == "cuda" else "default"  # the former uses CUDA graphs
-        self.model = torch.compile(policy, mode=mode, dynamic=self.device.type != "cuda") if settings.compile else policy
+        self.model = (
+            torch.compile(policy, mode=mode, dynamic=self.device.type != "cuda")
+            if settings.compile
+            else policy
+        )
         self._act_count = 0
 
     def begin_rollout(self, num_envs: int, rng: np.random.Generator) -> None:

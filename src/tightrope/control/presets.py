@@ -55,12 +55,15 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
     },
     "LunarLander-v3": {
         "num_envs": 16,
-        "num_steps": 1024,
-        "minibatch_size": 64,
-        "num_epochs": 4,
+        "num_steps": 256,
+        "minibatch_size": 256,
+        "num_epochs": 10,
         "gamma": 0.999,
         "gae_lambda": 0.98,
+        "learning_rate": 1e-3,
         "entropy_weight": 0.01,
+        "normalise_observations": True,
+        "normalise_rewards": True,
         "total_steps": 1_000_000,
     },
     "LunarLanderContinuous-v3": {
@@ -88,7 +91,7 @@ A2C_PRESETS: dict[str, dict[str, Any]] = {
 }
 
 REINFORCE_PRESETS: dict[str, dict[str, Any]] = {
-    "CartPole-v1": {"num_envs": 1, "num_steps": 1500, "learning_rate": 5e-3, "total_steps": 300_000},
+    "CartPole-v1": {"num_envs": 1, "num_steps": 1500, "learning_rate": 3e-3, "total_steps": 300_000},
 }
 
 BY_TASK = {"ppo": PPO_PRESETS, "a2c": A2C_PRESETS, "reinforce": REINFORCE_PRESETS}
@@ -111,8 +114,9 @@ def preset(
         values |= {"num_steps": 128, "learning_rate": 2.5e-4, "hidden": (), "shared": True}
         values |= {"num_epochs": 4, "minibatch_size": 256, "clip": 0.1} if algorithm == "ppo" else {}
         return values
+    values |= {"normalise_observations": True, "normalise_rewards": True}
     if kind == "continuous":
-        values |= {"normalise_observations": True, "normalise_rewards": True, "log_std_init": -0.5}
+        values["log_std_init"] = -0.5
     if algorithm == "a2c":
         values |= A2C_DEFAULT
     if algorithm == "reinforce":  # whole episodes must fit: several time limits per rollout
