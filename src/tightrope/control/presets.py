@@ -14,6 +14,18 @@ _MUJOCO = {
     "normalise_rewards": True,
 }
 
+_LANDER = {
+    "num_envs": 16,
+    "num_steps": 256,
+    "minibatch_size": 256,
+    "gamma": 0.999,
+    "gae_lambda": 0.98,
+    "learning_rate": 1e-3,
+    "normalise_observations": True,
+    "normalise_rewards": True,
+    "total_steps": 1_000_000,
+}
+
 PPO_PRESETS: dict[str, dict[str, Any]] = {
     "CartPole-v1": {
         "num_envs": 8,
@@ -53,28 +65,8 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "normalise_rewards": True,
         "total_steps": 200_000,
     },
-    "LunarLander-v3": {
-        "num_envs": 16,
-        "num_steps": 256,
-        "minibatch_size": 256,
-        "num_epochs": 10,
-        "gamma": 0.999,
-        "gae_lambda": 0.98,
-        "learning_rate": 1e-3,
-        "entropy_weight": 0.01,
-        "normalise_observations": True,
-        "normalise_rewards": True,
-        "total_steps": 1_000_000,
-    },
-    "LunarLanderContinuous-v3": {
-        "num_envs": 16,
-        "num_steps": 1024,
-        "minibatch_size": 64,
-        "num_epochs": 4,
-        "gamma": 0.999,
-        "gae_lambda": 0.98,
-        "total_steps": 1_000_000,
-    },
+    "LunarLander-v3": {**_LANDER, "entropy_weight": 0.01},
+    "LunarLanderContinuous-v3": _LANDER,
     "HalfCheetah-v5": {**_MUJOCO, "log_std_init": -1.0, "total_steps": 1_000_000},
     "Hopper-v5": {**_MUJOCO, "total_steps": 1_000_000},
     "Walker2d-v5": {**_MUJOCO, "log_std_init": -1.0, "total_steps": 1_000_000},
