@@ -69,7 +69,7 @@ def advantages_by_step(make, settings, *, rollouts=2):
     env = make()
     agent = tightrope.PPO(
         env, policy=Scripted(), seed=BASE_SEED, gamma=GAMMA, gae_lambda=LAMBDA, num_steps=COLUMNS,
-        **{"num_envs": 2, **settings},
+        normalise_observations=False, normalise_rewards=False, **{"num_envs": 2, **settings},
     )  # fmt: skip
     agent.collector.reset(BASE_SEED)
     found = {}

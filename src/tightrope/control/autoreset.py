@@ -95,9 +95,19 @@ class VectorCopies:
         self._inputs = inputs
         return inputs, self._masks(observations, infos, None)
 
-    def step(self, actions: np.ndarray) -> Step:
-        """Step all rows with the action matrix [B, A]."""
+    @property
+    def waves(self) -> tuple[slice, ...]:
+        """All rows at once: a vector environment steps them together."""
+        return (slice(0, self.num_envs),)
+
+    def begin(self, rows: slice, actions: np.ndarray) -> None:
+        """Take the action matrix [B, A]."""
+        self._actions = actions
+
+    def finish(self) -> Step:
+        """Step all rows with the actions taken."""
         self._count += 1
+        actions = self._actions
         env_actions = self.action_layout.to_env(actions)
         result = self._env.step(_to_int32(env_actions) if self._int32 else env_actions)
         if not isinstance(result, tuple) or len(result) != 5:

@@ -112,6 +112,7 @@ class Collector:
         rollout.finals, rollout.reward_statistics_taken = [], False
         noise = self.noise(num_steps, self.environments.num_envs, self.rng)
         engine.begin_rollout(self.environments.num_envs, self.rng)
+        waves = self.environments.waves
         inputs, action_mask, t, env_seconds = self._inputs, self._action_mask, 0, 0.0
         try:
             for t in range(num_steps):
@@ -119,9 +120,11 @@ class Collector:
                     rollout.inputs["action_mask"][:, t] = action_mask
                 if keep_raw:
                     rollout.raw[:, t] = inputs["flat"]
-                engine.act(inputs, self.normalisers.observations, action_mask, noise[t], rollout, t)
+                for rows in waves:
+                    engine.act(inputs, self.normalisers.observations, action_mask, noise[t], rollout, rows, t)
+                    self.environments.begin(rows, rollout.actions[rows, t])
                 before = perf_counter()
-                step = self.environments.step(rollout.actions[:, t])
+                step = self.environments.finish()
                 env_seconds += perf_counter() - before
                 inputs, action_mask = step.inputs, step.action_mask
                 rollout.rewards[:, t] = step.rewards

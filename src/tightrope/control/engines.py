@@ -54,19 +54,20 @@ class TorchEngine:
         action_mask: Array | None,
         noise: Array,
         rollout: Any,
+        rows: slice,
         t: int,
     ) -> None:
-        """Fill column ``t`` of the rollout: inputs as seen, actions and their log-probabilities."""
-        if self.policy.gsde:
+        """Fill ``rows`` of column ``t`` of the rollout: inputs as seen, actions, their log-probabilities."""
+        if self.policy.gsde and rows.stop == self._num_envs:  # the first wave of a step holds the last row
             if self._act_count % self.gsde_steps == 0:
                 self.policy.hold_exploration(self._num_envs, self._rng)
             self._act_count += 1
         for name, x in inputs.items():
-            seen = normaliser(x) if normaliser is not None and name == "flat" else x
-            rollout.inputs[name][:, t] = seen
-        tensors = self._tensors({name: rollout.inputs[name][:, t] for name in rollout.inputs})
-        actions, logp = self.policy.act(tensors, torch.from_numpy(noise).to(self.device))
-        rollout.actions[:, t], rollout.logp[:, t] = actions.cpu().numpy(), logp.cpu().numpy()
+            seen = normaliser(x[rows]) if normaliser is not None and name == "flat" else x[rows]
+            rollout.inputs[name][rows, t] = seen
+        tensors = self._tensors({name: rollout.inputs[name][rows, t] for name in rollout.inputs})
+        chosen = self.policy.act(tensors, torch.from_numpy(noise[rows]).to(self.device), rows)
+        rollout.actions[rows, t], rollout.logp[rows, t] = (x.cpu().numpy() for x in chosen)
 
     @torch.no_grad()
     def values(self, inputs: dict[str, Array]) -> Array:
@@ -139,12 +140,14 @@ class CompiledEngine:
         action_mask: Array | None,
         noise: Array,
         rollout: Any,
+        rows: slice,
         t: int,
     ) -> None:
-        """Fill column ``t`` of the rollout: inputs as seen, actions and their log-probabilities."""
+        """Fill ``rows`` of column ``t`` of the rollout: inputs as seen, actions, their log-probabilities."""
         mean, inverse_std = (None, None) if normaliser is None else (normaliser.mean, normaliser.inverse_std)
-        columns = (rollout.actions[:, t], rollout.logp[:, t], rollout.inputs["flat"][:, t])
-        self.fused.act(inputs["flat"], mean, inverse_std, CLIP, action_mask, noise, *columns)
+        mask = None if action_mask is None else action_mask[rows]
+        columns = (rollout.actions[rows, t], rollout.logp[rows, t], rollout.inputs["flat"][rows, t])
+        self.fused.act(inputs["flat"][rows], mean, inverse_std, CLIP, mask, noise[rows], *columns)
 
     def values(self, inputs: dict[str, Array]) -> Array:
         """Values [N] of encoded observations."""

@@ -85,6 +85,9 @@ class Environments:
         self.num_workers = backend.num_workers
         self.max_episode_steps = max_episode_steps
         self.squash = squash
+        self.waves = (
+            copies.waves
+        )  # rows in the order to act in: choosing the next overlaps with stepping the last
 
     def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
         """Reset every copy, copy i with ``seed + i`` (a vector environment: with ``seed``): inputs,
@@ -94,7 +97,17 @@ class Environments:
 
     def step(self, actions: np.ndarray) -> Step:
         """Act in every copy; ``actions`` [B, A] float32 as sampled, bounds are taken care of here."""
-        return self._copies.step(self.action_layout.squashed(actions) if self.squash else actions)
+        for rows in self.waves:
+            self.begin(rows, actions[rows])
+        return self.finish()
+
+    def begin(self, rows: slice, actions: np.ndarray) -> None:
+        """Act in the copies of one wave; those in worker processes begin to step at once."""
+        self._copies.begin(rows, self.action_layout.squashed(actions) if self.squash else actions)
+
+    def finish(self) -> Step:
+        """Step what has not begun and wait for the rest; every wave must have begun, in order."""
+        return self._copies.finish()
 
     def close(self) -> None:
         """Close every copy that was made here and end the workers."""

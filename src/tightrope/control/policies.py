@@ -169,14 +169,16 @@ class Policy(nn.Module):
         return self.trunk(x) if self.trunk is not None else x
 
     @torch.no_grad()
-    def act(self, inputs: Inputs, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def act(self, inputs: Inputs, noise: Tensor, rows: slice = slice(None)) -> tuple[Tensor, Tensor]:
         """Sampled actions [N, A] and their log-probabilities [N]; with gSDE the held exploration makes the
         noise.
         """
         distribution, latent = self._actor(inputs)
         if self.gsde and self.exploration is not None:
             assert latent is not None and self.log_std is not None and distribution.log_std is not None
-            held = torch.einsum("nf,nfd->nd", latent, self.exploration * self.log_std.clamp(-20, 2).exp())
+            held = torch.einsum(
+                "nf,nfd->nd", latent, self.exploration[rows] * self.log_std.clamp(-20, 2).exp()
+            )
             noise = noise.clone()
             noise[:, self._gaussian_columns()] = held * (-distribution.log_std).exp()
         actions = distribution.sample(noise)

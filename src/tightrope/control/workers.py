@@ -136,11 +136,23 @@ class EnvCopies:
         step = self._slots.step(self._has_masks)
         return step.inputs, step.action_mask
 
-    def step(self, actions: np.ndarray) -> Step:
-        """Step every copy; the workers start first, this process steps its own meanwhile."""
-        self._slots.actions[...] = actions
-        for worker in self._workers:
-            worker.tell(b"s")
+    @property
+    def waves(self) -> tuple[slice, ...]:
+        """Rows in the order in which to choose their actions: the workers' first, so that they step while the
+        actions of this process's own copies are chosen.
+        """
+        total, own = len(self._slots.actions), len(self._own.envs)
+        return (slice(own, total), slice(0, own)) if self._workers else (slice(0, total),)
+
+    def begin(self, rows: slice, actions: np.ndarray) -> None:
+        """Take the actions of one wave; the workers start at once."""
+        self._slots.actions[rows] = actions
+        if rows.start:
+            for worker in self._workers:
+                worker.tell(b"s")
+
+    def finish(self) -> Step:
+        """Step this process's own copies and wait for the workers', all waves having begun."""
         self._own.step()
         for worker in self._workers:
             worker.wait()

@@ -39,11 +39,13 @@ OPTIONS = {
     "_nrt": False,
 }  # nothing is allocated
 
-_LATE: set[str] = set()  # names of functions that are optimised within their callers alone
+_INNER: set[str] = set()  # names of functions that compiled functions alone call
+_LATE: set[str] = set()  # names of those that are optimised within their callers alone
 
 
 def kernel(function: Any) -> Any:
     """Compile loops over rows; the compiler may reorder their sums and products (always in the same way)."""
+    _INNER.add(function.__name__)
     return numba.njit(fastmath=FLAGS, no_cpython_wrapper=True, **OPTIONS)(function)
 
 
@@ -56,6 +58,7 @@ def glue(function: Any) -> Any:
 def element(function: Any) -> Any:
     """Compile a function of one number whose rounding steps carry its accuracy: no reordering, fused
     multiply-add only."""
+    _INNER.add(function.__name__)
     _LATE.add(function.__name__)
     return numba.njit(fastmath={"contract"}, forceinline=True, no_cpython_wrapper=True, **OPTIONS)(function)
 
@@ -86,26 +89,47 @@ llvm.add_symbol("tightrope_yield", ctypes.cast(_YIELD, ctypes.c_void_p).value)
 
 
 @contextlib.contextmanager
-def _late_optimisation() -> Iterator[None]:
-    """Leave glue and element functions as they are until they stand in their callers.
+def _whole_programs() -> Iterator[None]:
+    """Make machine code of entries alone, and leave glue and element functions as they are until they stand
+    in their callers.
 
-    numba optimises each function, and again all it calls within each caller, which takes most of the compile
-    time.
-    Where a version of numba has other insides, it goes its own way and only takes longer.
+    numba optimises each function and makes machine code of it, and does both again with all it calls within
+    each caller: most of the compile time. That code would be worse than useless: of functions with one name
+    the process takes the first, and a process that compiles would round otherwise than one that loads the
+    entries. So these see only functions of their own. Where a version of numba has other insides, it goes
+    its own way.
     """
-    original = getattr(codegen.CPUCodeLibrary, "_optimize_final_module", None)
+    library = codegen.CPUCodeLibrary
+    names = ("_optimize_final_module", "_finalize_final_module")
+    originals = [getattr(library, name, None) for name in names]
+    if None in originals:
+        yield
+        return
+    optimise, finalise = originals
 
-    def optimise(library: Any) -> None:
-        if library.name not in _LATE:
-            original(library)
+    def optimise_late(self: Any) -> None:
+        if self.name not in _LATE:
+            optimise(self)
 
-    if original is not None:
-        codegen.CPUCodeLibrary._optimize_final_module = optimise
+    def finalise_entries(self: Any) -> None:
+        if self.name not in _INNER:
+            for function in self._final_module.functions:
+                if function.linkage == llvm.Linkage.linkonce_odr:
+                    function.linkage = llvm.Linkage.internal
+            finalise(self)
+            return
+        module = self._final_module  # what the callers link
+        shared = [x.name for x in module.global_variables if x.linkage == llvm.Linkage.common]
+        # numba writes into these variables (an environment per function), so they must lie somewhere
+        self._final_module = llvm.parse_assembly("\n".join(f'@"{x}" = common global i64 0' for x in shared))
+        finalise(self)
+        self._final_module = module
+
+    library._optimize_final_module, library._finalize_final_module = optimise_late, finalise_entries
     try:
         yield
     finally:
-        if original is not None:
-            codegen.CPUCodeLibrary._optimize_final_module = original
+        library._optimize_final_module, library._finalize_final_module = originals
 
 
 def entry(signature: str) -> Callable[[Any], Any]:
@@ -117,7 +141,7 @@ def entry(signature: str) -> Callable[[Any], Any]:
         found = None if folder is None else load(folder, function, numba.njit(**options))
         if found is not None:
             return found
-        with _late_optimisation():
+        with _whole_programs():
             made = numba.njit(signature, **options)(function)
         if folder is not None:
             store(folder, function, made)
