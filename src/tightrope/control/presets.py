@@ -36,6 +36,8 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "gamma": 0.99,
         "learning_rate": 1e-3,
         "entropy_weight": 0.0,
+        "normalise_observations": True,
+        "normalise_rewards": True,
         "total_steps": 100_000,
     },
     "Acrobot-v1": {
