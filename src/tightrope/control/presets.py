@@ -43,10 +43,12 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
     "Acrobot-v1": {
         "num_envs": 16,
         "num_steps": 256,
+        "minibatch_size": 256,
         "gae_lambda": 0.94,
-        "num_epochs": 4,
-        "normalise_observations": True,
+        "learning_rate": 1e-3,
         "entropy_weight": 0.0,
+        "normalise_observations": True,
+        "normalise_rewards": True,
         "total_steps": 500_000,
     },
     "MountainCarContinuous-v0": {
