@@ -281,15 +281,14 @@ def main(words: list[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return _dispatch(words)
-    except (ValueError, PermissionError, FileExistsError, NotADirectoryError) as error:
-        if isinstance(error, ValueError) and not _is_ours(error):
+    except (ValueError, OSError, RuntimeError) as error:
+        if isinstance(error, BrokenPipeError):
+            # whoever read our output is gone; Python must not try to flush to it on its way out
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        if not isinstance(error, OSError) and not _is_ours(error):
             raise
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return 2
-    except (
-        BrokenPipeError
-    ):  # whoever read our output is gone; Python must not try to flush to it on its way out
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except KeyboardInterrupt:
         return 130

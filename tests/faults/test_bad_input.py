@@ -149,3 +149,95 @@ def test_risky_settings_are_trained_as_asked_with_a_warning(flags, words, capsys
     assert code == 0
     assert words in err
     assert json.loads(out.strip().splitlines()[-1])["steps"] > 0
+
+
+class Late(Faulty):
+    """Goes wrong only in the copy that was seeded with 3."""
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            self.mine = seed == 3
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return (observation if self.mine else np.zeros(3, np.float32)), reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize(
+    ("at", "last", "what"), [(20, True, "final observation"), (16, False, "observation")]
+)
+def test_the_right_environment_and_step_are_named(at, last, what):
+    """Also for a true final observation, and for the one after a rollout's last column."""
+    agent = tightrope.PPO(
+        lambda: Late("nan", at=at, last=last), vector_backend="serial", **{**SMALL, "num_envs": 4}
+    )
+    with pytest.raises(BadNumbers, match=rf"Environment 3 .* {what} = nan at step {at}, index 1"):
+        agent.learn(400)
+
+
+def test_an_environment_that_breaks_ends_the_command_with_2(capsys, tmp_path):
+    gym.register("tightrope_tests/Four-v0", entry_point=lambda: Faulty("four"))
+    try:
+        code = main(
+            ["train", "tightrope_tests/Four-v0", "--total-steps", "500", "--run-dir", str(tmp_path / "r")]
+        )
+    finally:
+        del gym.registry["tightrope_tests/Four-v0"]
+    assert code == 2
+    assert "expected 5, got 4" in capsys.readouterr().err
+
+
+def test_save_never_replaces_what_is_no_checkpoint(tmp_path):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.tex").write_text("years of work")
+    agent = tightrope.PPO("CartPole-v1", **SMALL)
+    with pytest.raises(ValueError, match="not replaced"):
+        agent.save(tmp_path / "home")
+    assert (tmp_path / "home" / "thesis.tex").read_text() == "years of work"
+    agent.save(tmp_path / "pole")
+    agent.save(tmp_path / "pole")
+    (tmp_path / "pole" / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="not replaced"):
+        agent.save(tmp_path / "pole")
+
+
+class MethodMask(Faulty):
+    """Forbids action 0 by a method alone."""
+
+    def __init__(self):
+        super().__init__("none")
+
+    def action_masks(self):
+        return np.array([False, True])
+
+    def step(self, action):
+        assert action == 1
+        return super().step(action)
+
+
+@pytest.mark.parametrize("kind", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
+def test_masks_by_method_reach_through_vector_environments(kind):
+    env = kind([MethodMask] * 2)
+    tightrope.PPO(env, **SMALL).learn(128)
+    env.close()
+
+
+def test_predict_refuses_a_mask_that_forbids_everything():
+    agent = tightrope.PPO("CartPole-v1", **SMALL)
+    with pytest.raises(ValueError, match="allow at least one"):
+        agent.predict(np.zeros(4, np.float32), action_masks=[0, 0])
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"gamma": "0.9"}, "expected float"),
+        ({"hidden": 64}, "tuple"),
+        ({"n_steps": 5}, "Did you mean num_steps"),
+    ],
+)
+def test_python_settings_of_the_wrong_kind_are_named(values, words):
+    with pytest.raises(ValueError, match=words):
+        tightrope.PPO("CartPole-v1", **values)
+    assert tightrope.PPO("Pendulum-v1", log_std_init=-1, num_envs=1).settings.log_std_init == -1.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self, get_args, get_type_hints
 
 Schedule = Literal["constant", "linear", "cosine"]
 
@@ -47,8 +47,33 @@ def range_text(metadata: Any) -> str:
     return f"{low}x{high}" if low or high else ""
 
 
+def check_types(settings: Any) -> None:
+    """Raise ValueError for a value of the wrong kind; a whole number is taken for a float, a list for a
+    tuple.
+    """
+    for name, hint in get_type_hints(type(settings)).items():
+        if name not in getattr(settings, "__dataclass_fields__", {}):
+            continue
+        value, kinds = getattr(settings, name), set(get_args(hint)) | {hint}
+        words = str(hint).replace("typing.", "").removeprefix("<class '").removesuffix("'>")
+        if value is None:
+            good = type(None) in kinds
+        elif float in kinds and isinstance(value, int) and not isinstance(value, bool):
+            object.__setattr__(settings, name, float(value))
+            good = True
+        elif "tuple" in words:
+            good = isinstance(value, list | tuple) and all(type(x) is int for x in value)
+            object.__setattr__(settings, name, tuple(value) if good else value)
+        else:
+            plain = {kind for kind in kinds if kind in (bool, int, float, str)}
+            good = not plain or (type(value) in plain) or (isinstance(value, str) and "Literal" in words)
+        if not good:
+            raise ValueError(f"{name} is {value!r} ({type(value).__name__}); expected {words}.")
+
+
 def check_ranges(settings: Any) -> None:
-    """Raise ValueError naming the first field outside its declared range: value seen, range, what to do."""
+    """Raise ValueError naming the first field of a wrong kind or outside its declared range."""
+    check_types(settings)
     for field in dataclasses.fields(settings):
         value, metadata = getattr(settings, field.name), field.metadata
         if value is None:

@@ -68,7 +68,9 @@ class Agent:
         present = self.settings
         torch_device = torch.device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
-        self.policy = Policy(*layouts, present, policy).to(torch_device)
+        threads = present.threads or (available_cores() if layouts[0].image_shapes else 1)
+        with limited_threads(threads):  # the QR of the first weights rounds differently with more threads
+            self.policy = Policy(*layouts, present, policy).to(torch_device)
         self.optimiser = make_optimiser(
             self.policy.parameters(), self.policy.critic_parameters(), present.update
         )
@@ -77,11 +79,12 @@ class Agent:
         self.engine, self.engine_line = engines.choose(
             self.policy, self.optimiser, present, self.cores, notify
         )
-        self.sampling_rng, self.update_rng = (np.random.default_rng([present.seed, k]) for k in (1, 2))
+        # three streams: what predict draws must not change what training draws
+        seeds = ([present.seed, k] for k in (1, 2, 4))
+        self.sampling_rng, self.update_rng, self.predict_rng = (np.random.default_rng(x) for x in seeds)
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
         self.steps, self.kl_beta = 0, getattr(present.update, "kl_beta", None)
         self._fresh, self.notify = True, notify
-        threads = present.threads or (self.cores if layouts[0].image_shapes else 1)
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
 
     # ---------------------------------------------------------------------------------------------- learning
@@ -105,18 +108,19 @@ class Agent:
             self.collector.reset(self.settings.seed + self.steps)
             self._fresh = False
         first = True
-        while (columns := self._next_columns(budget - (self.steps - start), first)) > 0:
+        while (columns := self._next_columns(budget, start)) > 0:
             with limited_threads(self.settings.threads or 1):
                 metrics, episodes = self._one_update(columns, (self.steps - start) / budget, check=first)
             first = False
             yield Progress(self.steps - start, budget, metrics, episodes)
 
-    def _next_columns(self, remaining: int, first: bool) -> int:
-        """Columns of the next rollout, never more than the budget allows; a crumb at the end is not learned
-        from.
+    def _next_columns(self, budget: int, start: int) -> int:
+        """Columns of the next rollout, never more than the budget allows; a crumb at its end is left
+        alone.
         """
-        columns = min(self.settings.num_steps, remaining // self.environments.num_envs)
-        return columns if first or columns >= min(CRUMB, self.settings.num_steps) else 0
+        columns = min(self.settings.num_steps, (budget - (self.steps - start)) // self.environments.num_envs)
+        enough = self.steps == start or columns >= min(CRUMB, self.settings.num_steps)
+        return columns if enough else 0
 
     def _one_update(
         self, columns: int, progress: float, *, check: bool
@@ -145,8 +149,9 @@ class Agent:
             metrics["train/explained_variance"] = float(
                 explained_variance(batch.old_values, batch.returns, batch.mask)
             )
-        if isinstance(present, PPOSettings) and present.kl_beta is not None and present.kl_adapt is not None:
-            self.kl_beta = ppo.next_kl_beta(present.kl_beta, metrics["train/approx_kl"], present.kl_adapt)
+        kl = metrics.get("train/approx_kl")
+        if isinstance(present, PPOSettings) and present.kl_beta and present.kl_adapt and kl is not None:
+            self.kl_beta = ppo.next_kl_beta(present.kl_beta, kl, present.kl_adapt)
         self.normalisers.update(rollout)
         self.steps += rollout.steps
         finish = time.perf_counter()
@@ -182,6 +187,8 @@ class Agent:
         masks = layout.mask_of(observation) if action_masks is None and layout.has_mask else action_masks
         flat_mask = actions.flatten_mask(masks, rows)
         if flat_mask is not None:
+            if len(blocked := actions.blocked_rows(flat_mask)):
+                raise ValueError(f"action_masks forbid every choice in row {blocked[0]}; allow at least one.")
             inputs = {**inputs, "action_mask": flat_mask}
         tensors = {
             k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()
@@ -189,10 +196,7 @@ class Agent:
         if deterministic:
             chosen = self.policy.mode(tensors)
         else:
-            noise = self.noise(rows, self.sampling_rng)
-            if self.policy.gsde:
-                self.policy.hold_exploration(rows, self.sampling_rng)
-            chosen = self.policy.act(tensors, noise)[0]
+            chosen = self.policy.sample(tensors, self.noise(rows, self.predict_rng), self.predict_rng)
         matrix = chosen.cpu().numpy()
         squash = self.settings.squash
         return (actions.to_env(matrix, squash) if batched else actions.to_env_single(matrix[0], squash)), None
@@ -224,7 +228,8 @@ class Agent:
 
         Raises ValueError, with nothing changed, when the spaces differ.
         """
-        free = anywhere(self.settings)
+        rows = getattr(env, "num_envs", self.settings.num_envs)
+        free = dataclasses.replace(anywhere(self.settings), num_envs=rows)
         fresh, old = _environments(env, free), self.environments
         for name in ("observation_layout", "action_layout"):
             seen, expected = getattr(fresh, name).space, getattr(old, name).space

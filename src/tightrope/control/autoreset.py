@@ -236,7 +236,23 @@ class VectorCopies:
             return "info"
         if callable(getattr(self._env.unwrapped, "action_masks", None)):
             return "method"
+        if self._copies_have_masks():
+            return "call"
         return "observation" if self.observation_layout.has_mask else "none"
+
+    def _copies_have_masks(self) -> bool:
+        """Whether the single environments inside Gymnasium's vector environments have ``action_masks``."""
+        env = self._env.unwrapped
+        copies = getattr(env, "envs", None)
+        if copies:
+            return callable(getattr(copies[0].unwrapped, "action_masks", None))
+        if not hasattr(env, "call_async"):
+            return False
+        try:  # copies in other processes can only be asked
+            env.call("action_masks")
+        except Exception:  # whatever they raise says that they have none
+            return False
+        return True
 
     def _masks(self, observations: Any, infos: dict[str, Any], idle: np.ndarray | None) -> np.ndarray | None:
         """The action masks; rows in ``idle`` (whose next action is not used) allow everything."""
@@ -245,12 +261,13 @@ class VectorCopies:
         if self._mask_source == "info":
             raw, given = infos.get(MASK_KEY), infos.get("_" + MASK_KEY)
         else:
-            method = self._mask_source == "method"
-            raw = (
-                self._env.unwrapped.action_masks()
-                if method
-                else self.observation_layout.mask_of(observations)
-            )
+            env = self._env.unwrapped
+            if self._mask_source == "method":
+                raw = env.action_masks()
+            elif self._mask_source == "call":
+                raw = np.stack([np.asarray(mask) for mask in env.call("action_masks")])
+            else:
+                raw = self.observation_layout.mask_of(observations)
             given = None
         needed = np.ones(self.num_envs, bool) if idle is None else ~idle
         if needed.any() and (raw is None or (given is not None and not np.asarray(given)[needed].all())):

@@ -152,20 +152,22 @@ class Collector:
         """Raise BadNumbers naming environment, step and index of the first NaN or infinity, if there is
         one.
         """
-        checks = [
-            ("observation", rollout.raw[:, :num_steps]),
-            ("reward", rollout.rewards[:, :num_steps, None]),
-        ]
-        checks += [("observation", x["flat"][:, None]) for x in [self._inputs] if "flat" in x]
-        checks += [("final observation", x["flat"][:, None]) for _, _, x in rollout.finals if "flat" in x]
-        for what, numbers in checks:
+        rows, start = np.arange(len(rollout.logp)), self._step_count
+        checks = [("observation", rollout.raw[:, :num_steps], rows, start)]
+        checks += [("reward", rollout.rewards[:, :num_steps, None], rows, start)]
+        if "flat" in self._inputs:
+            checks.append(("observation", self._inputs["flat"][:, None], rows, start + num_steps))
+        for t, final_rows, x in rollout.finals:
+            if "flat" in x:
+                checks.append(("final observation", x["flat"][:, None], final_rows, start + t + 1))
+        for what, numbers, which, first in checks:
             good = np.isfinite(numbers)
             if good.all():
                 continue
             row, t, index = np.argwhere(~good)[0]
-            where = f"step {self._step_count + t}" + ("" if what == "reward" else f", index {index}")
+            where = f"step {first + t}" + ("" if what == "reward" else f", index {index}")
             raise BadNumbers(
-                f"Environment {row} of {self.environments.spec_id} returned "
+                f"Environment {which[row]} of {self.environments.spec_id} returned "
                 f"{what} = {numbers[row, t, index]} at {where}; expected finite "
                 "numbers. The policy was not updated with it. Mend the environment, or clip and check its "
                 "state there."

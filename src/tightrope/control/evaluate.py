@@ -64,9 +64,7 @@ def act(
     if rng is None:
         return policy.mode(tensors).cpu().numpy()
     rows = len(next(iter(inputs.values())))
-    if policy.gsde:
-        policy.hold_exploration(rows, rng)
-    return policy.act(tensors, agent.noise(rows, rng))[0].cpu().numpy()
+    return policy.sample(tensors, agent.noise(rows, rng), rng).cpu().numpy()
 
 
 def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:

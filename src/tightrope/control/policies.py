@@ -184,6 +184,15 @@ class Policy(nn.Module):
         actions = distribution.sample(noise)
         return actions, distribution.logp(actions)
 
+    def sample(self, inputs: Inputs, noise: Tensor, rng: np.random.Generator) -> Tensor:
+        """Sampled actions [N, A] outside a rollout: fresh exploration, and the held one is left as it is."""
+        held = self.exploration
+        self.hold_exploration(len(noise), rng)
+        try:
+            return self.act(inputs, noise)[0]
+        finally:
+            self.exploration = held
+
     @torch.no_grad()
     def mode(self, inputs: Inputs) -> Tensor:
         """The most likely actions [N, A]."""

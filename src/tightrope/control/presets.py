@@ -55,10 +55,7 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "num_envs": 8,
         "num_steps": 256,
         "std": "gsde",
-        "gsde_steps": 64,
-        "log_std_init": -1.0,
-        "gamma": 0.9999,
-        "gae_lambda": 0.9,
+        "gsde_steps": 256,
         "normalise_observations": True,
         "normalise_rewards": True,
         "total_steps": 100_000,
@@ -110,7 +107,13 @@ def preset(
         return dict(listed)
     values: dict[str, Any] = {"entropy_weight": 0.0 if kind == "continuous" else 0.01}
     if kind == "images":
-        values |= {"num_steps": 128, "learning_rate": 2.5e-4, "hidden": (), "shared": True}
+        values |= {
+            "num_steps": 128,
+            "learning_rate": 2.5e-4,
+            "hidden": (),
+            "shared": True,
+            "normalise_rewards": True,
+        }
         values |= {"num_epochs": 4, "minibatch_size": 256, "clip": 0.1} if algorithm == "ppo" else {}
         return values
     values |= {"normalise_observations": True, "normalise_rewards": True}

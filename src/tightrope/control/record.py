@@ -53,6 +53,11 @@ def record_run(
 
 def _renderable(env: Any, name: str) -> gym.Env:
     """A fresh environment that renders to arrays."""
+    if isinstance(env, str) and env.startswith("ALE/"):
+        raise ValueError(
+            f"{name} was trained on Atari's vector version (stacked, grey, 84 x 84), which cannot render. "
+            "Recording it is not supported yet."
+        )
     if isinstance(env, str):
         try:
             return tasks.make_by_id(env, render_mode="rgb_array")

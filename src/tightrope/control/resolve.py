@@ -25,12 +25,10 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
     num_envs = getattr(env, "num_envs", None)  # a vector environment has its own number of copies
     if num_envs is not None:
         chosen["num_envs"] = int(num_envs)
-    rollout = {**chosen, **values}
-    steps = rollout.get("num_envs", 8) * rollout.get("num_steps", 256)
-    if "minibatch_size" in chosen and "minibatch_size" not in values:
-        chosen["minibatch_size"] = min(chosen["minibatch_size"], steps)
-    elif algorithm == "ppo" and "minibatch_size" not in values:
-        chosen["minibatch_size"] = min(64, steps)
+    merged = {"num_envs": 8, "num_steps": 256, **chosen, **values}
+    sizes = (merged["num_envs"], merged["num_steps"])
+    if algorithm == "ppo" and "minibatch_size" not in values and all(type(size) is int for size in sizes):
+        chosen["minibatch_size"] = max(1, min(chosen.get("minibatch_size", 64), sizes[0] * sizes[1]))
     return TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
 
 

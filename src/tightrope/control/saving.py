@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from tightrope.control.agent import AGENTS, Agent, anywhere
-from tightrope.control.settings import settings_from_json, settings_to_json
+from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import checkpoint
 
 
@@ -62,11 +62,22 @@ def load(
             getattr(env, "num_envs", settings.num_envs),
         )
         settings = dataclasses.replace(anywhere(settings), env=name, num_envs=rows)
-    agent = AGENTS[settings.algorithm](
-        env if env is not None else settings.env, policy=policy, settings=settings
-    )
+    agent = rebuild(settings.env if env is None else env, path, policy=policy, settings=settings)
     restore(agent, tensors, state)
     return agent
+
+
+def rebuild(env: Any, path: str | Path, *, settings: TrainSettings, **more: Any) -> Agent:
+    """An agent for saved settings; a task that is not registered (any more) is answered with what to name."""
+    try:
+        return AGENTS[settings.algorithm](env, settings=settings, **more)
+    except ValueError as error:
+        if not str(error).startswith("unknown environment id"):
+            raise
+        raise ValueError(
+            f"{error} {path} was trained on it: where your own code registers it, name that code again, "
+            "with --env-module FILE.py on the command line or an import in Python."
+        ) from error
 
 
 def agent_folder(path: Path, *, best: bool = False) -> Path:

@@ -18,6 +18,7 @@ from tightrope.algorithms.settings import (
     check_ranges,
     setting,
 )
+from tightrope.control.peer_names import PEER_NAMES
 
 Algorithm = Literal["ppo", "a2c", "reinforce"]
 ALGORITHM_SETTINGS: dict[str, type[UpdateSettings]] = {
@@ -158,7 +159,9 @@ class TrainSettings:
         inner = {k: v for k, v in values.items() if k not in names}
         unknown = sorted(set(inner) - update_names)
         if unknown:
-            raise ValueError(f"{algorithm} has no setting named {', '.join(unknown)}.")
+            near = [PEER_NAMES.get(unknown[0]), *difflib.get_close_matches(unknown[0], names | update_names)]
+            hint = next((f" Did you mean {name}?" for name in near if name), "")
+            raise ValueError(f"{algorithm} has no setting named {', '.join(unknown)}.{hint}")
         update = own.get("update", self.update)
         own["update"] = dataclasses.replace(update, **inner) if isinstance(update, kind) else kind(**inner)
         return dataclasses.replace(self, **own)

@@ -115,6 +115,8 @@ def make_vector_by_id(env_id: str, num_envs: int) -> Any:
 
     def made() -> Any:
         same_step: dict[str, Any] = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
+        if env_id.startswith("ALE/"):
+            same_step["reward_clipping"] = False  # returns are reported in the game's own points
         try:
             return gym.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **same_step)
         except TypeError as error:

@@ -13,7 +13,7 @@ from typing import Any
 from tightrope.control.agent import AGENTS, Agent, Progress
 from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
-from tightrope.control.saving import restore, save_agent
+from tightrope.control.saving import rebuild, restore, save_agent
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import checkpoint
 from tightrope.runs.run import Run
@@ -74,9 +74,10 @@ def resume(
     if total_steps is not None:
         settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
-    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=_notice(report))
+    agent = rebuild(source, run_dir, policy=policy, settings=settings, notify=_notice(report))
     restore(agent, tensors, state)
     run.rewind(agent.steps)
+    run.update_settings(settings_to_json(agent.settings))
     if agent.steps + settings.num_envs > settings.total_steps:
         report(
             "line",
@@ -95,9 +96,10 @@ def _continue(
     report("start", _start(agent, run))
     evaluate_at = _Grid(settings.evaluate_every, total_steps, begin)
     save_at = _Grid(settings.checkpoint_every, total_steps, begin)
+    interrupt = Interrupt()
     try:
         clock = time.perf_counter()
-        for progress in Interrupt().between(agent.iterate(total_steps, start=0)):
+        for progress in interrupt.between(agent.iterate(total_steps, start=0)):
             wall += time.perf_counter() - clock
             step, metrics = agent.steps, {**progress.metrics, "time/seconds": wall}
             if evaluate_at.due(step):
@@ -113,7 +115,8 @@ def _continue(
         final = evaluator.evaluate()
         _save(agent, run, evaluator.best, wall)
     except KeyboardInterrupt:
-        _save(agent, run, evaluator.best, wall)
+        if not interrupt.torn:
+            _save(agent, run, evaluator.best, wall)
         raise
     finally:
         evaluator.close()
@@ -152,10 +155,11 @@ class Interrupt:
     """
 
     def __init__(self) -> None:
-        self.asked = False
+        self.asked, self.torn = False, False
 
     def _ask(self, number: int, frame: Any) -> None:
         if self.asked:
+            self.torn = True  # in the middle of an update: what is there now must not be saved
             raise KeyboardInterrupt
         self.asked = True
 

@@ -56,6 +56,7 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
     a plain name, OSError as the system does.
     """
     folder = Path(folder)
+    _refuse_to_replace(folder)
     for stem in tensors:
         if not _STEM.fullmatch(stem):
             raise CheckpointError(
@@ -90,11 +91,26 @@ def _fill(temporary: Path, tensors: dict[str, dict[str, Tensor]], state: dict[st
     write_json(temporary / "manifest.json", {"format": FORMAT, "version": VERSION, "files": files})
 
 
+def _refuse_to_replace(folder: Path) -> None:
+    """CheckpointError unless the folder is free, empty, or holds a checkpoint and nothing beside it."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    try:
+        _declared(folder)
+    except (CheckpointError, OSError) as error:
+        raise CheckpointError(
+            f"{folder} is there already and is no checkpoint of this library, so it is not replaced "
+            f"({error}). Save under another name."
+        ) from error
+
+
 def _put(temporary: Path, folder: Path) -> None:
     """Rename into place. A folder cannot be renamed over a full one, so an old one steps aside first; see
     `load`.
     """
     aside = _aside(folder)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
     if folder.exists():
         if aside.exists():
             shutil.rmtree(aside)

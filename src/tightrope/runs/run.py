@@ -140,6 +140,11 @@ class Run:
         for parent in (self.path, self.checkpoints):
             checkpoint.remove_leftovers(parent)
 
+    def update_settings(self, settings: dict[str, Any]) -> None:
+        """Replace settings.json: a resumed run may go on under another budget."""
+        self.settings = plain(settings)
+        write_json(self.path / "settings.json", self.settings)
+
     def finish(self, summary: dict[str, Any]) -> None:
         """Write summary.json, the sign of a run that came to its end, and close the files."""
         write_json(self.path / "summary.json", summary)

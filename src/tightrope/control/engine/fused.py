@@ -33,6 +33,11 @@ _NOTHING = np.zeros(0, np.float32)
 _NO_MASK = np.zeros((0, 1), bool)
 
 
+# For the comparison with ppo.py: an Adam whose step is nearly the gradient itself. With its own tiny epsilon
+# a gradient of pure rounding error would move a parameter by a whole learning rate.
+SMOOTH = {"lr": 1.0, "eps": 1.0}
+
+
 class FusedEngine:
     """The compiled execution of ``ppo.update`` for one policy and its optimiser (torch.optim.Adam).
 
@@ -228,6 +233,8 @@ class FusedEngine:
         results = []
         for compute in (self._with_torch, self._with_engine):
             policy, optimiser = copy.deepcopy((self.policy, self.optimiser))
+            for group in optimiser.param_groups:
+                group.update(SMOOTH)
             compute(policy, optimiser, steps, once)
             results.append([p.detach() for p in policy.parameters()])
         return max(float((a - b).abs().max()) for a, b in zip(*results, strict=True))

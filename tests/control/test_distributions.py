@@ -1,0 +1,108 @@
+"""Densities are densities, and what is sampled has the density that is claimed."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from tightrope.control.distributions import Distribution
+from tightrope.control.policies import Policy
+from tightrope.control.settings import TrainSettings
+from tightrope.control.spaces import action_layout, observation_layout
+
+
+def box(low, high):
+    return action_layout(spaces.Box(np.float32(low), np.float32(high), (1,), np.float32))
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-3.0, 5.0)])
+@pytest.mark.parametrize("mean", [-0.7, 0.0, 1.2])
+def test_a_squashed_density_integrates_to_one_in_the_environments_own_units(low, high, mean):
+    layout, half = box(low, high), torch.tensor([(high - low) / 2])
+    u = torch.linspace(-9, 9, 20001)[:, None]
+    distribution = Distribution(layout, torch.full((len(u), 1), mean), torch.tensor([-0.3]), None, half)
+    density = distribution.logp(u).double().exp()
+    action = torch.from_numpy(layout.to_env(u.numpy(), squash=True))[:, 0].double()
+    assert float(torch.trapezoid(density, action)) == pytest.approx(1.0, abs=1e-3)
+    entropy = -torch.trapezoid(torch.xlogy(density, density), action)
+    assert float(distribution.entropy()[0]) == pytest.approx(float(entropy), abs=5e-3)
+
+
+def test_a_gaussian_density_is_the_textbooks():
+    distribution = Distribution(box(-9, 9), torch.tensor([[0.5]]), torch.tensor([math.log(2.0)]))
+    expected = -0.5 * ((1.5 - 0.5) / 2) ** 2 - math.log(2) - 0.5 * math.log(2 * math.pi)
+    assert float(distribution.logp(torch.tensor([[1.5]]))) == pytest.approx(expected, abs=1e-6)
+    assert float(distribution.entropy()) == pytest.approx(0.5 * math.log(2 * math.pi * math.e * 4), abs=1e-6)
+
+
+def make_policy(**values):
+    layouts = observation_layout(spaces.Box(-1, 1, (3,), np.float32)), box(-9, 9)
+    return Policy(*layouts, TrainSettings(hidden=(8,), **values))
+
+
+@torch.no_grad()
+def test_gsde_noise_has_the_deviation_that_its_density_claims():
+    """Over many exploration matrices the actions of one state spread by exp(log_std) of its distribution."""
+    policy, rng = make_policy(std="gsde", log_std_init=-0.4), np.random.default_rng(0)
+    rows = 20_000
+    inputs = {"flat": torch.tensor([[0.3, -0.8, 0.5]]).expand(rows, 3).contiguous()}
+    policy.hold_exploration(rows, rng)
+    actions, logp = policy.act(inputs, torch.zeros(rows, 1))
+    distribution, _ = policy.evaluate(inputs)
+    claimed = float(distribution.log_std[0].exp())
+    assert float(actions.std()) == pytest.approx(claimed, rel=0.02)
+    assert float(actions.mean()) == pytest.approx(float(distribution.parameters[0]), abs=0.02)
+    latent = policy.actor[:-1](inputs["flat"][:1])
+    by_hand = (latent.square() * (2 * policy.log_std).exp().T).sum().sqrt()
+    assert claimed == pytest.approx(float(by_hand), rel=1e-4)
+    z = (actions[:, 0] - distribution.parameters[:, 0]) / claimed
+    expected = -0.5 * z.square() - math.log(claimed) - 0.5 * math.log(2 * math.pi)
+    torch.testing.assert_close(logp, expected.detach(), rtol=1e-3, atol=1e-3)
+
+
+def test_gsde_holds_its_noise_and_predict_leaves_it_alone():
+    policy, rng = make_policy(std="gsde"), np.random.default_rng(0)
+    inputs = {"flat": torch.rand(4, 3)}
+    policy.hold_exploration(4, rng)
+    first, _ = policy.act(inputs, torch.zeros(4, 1))
+    policy.sample({"flat": torch.rand(2, 3)}, torch.zeros(2, 1), np.random.default_rng(5))
+    again, _ = policy.act(inputs, torch.ones(4, 1))
+    assert torch.equal(first, again)
+    policy.hold_exploration(4, rng)
+    assert not torch.equal(first, policy.act(inputs, torch.zeros(4, 1))[0])
+
+
+@torch.no_grad()
+def test_state_dependent_deviation_depends_on_the_state():
+    policy = make_policy(std="state")
+    with torch.no_grad():
+        policy.actor[-1].weight.mul_(100)
+    distribution, _ = policy.evaluate({"flat": torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])})
+    assert distribution.log_std.shape == (2, 1)
+    assert abs(float((distribution.log_std[0] - distribution.log_std[1]).detach())) > 0.01
+
+
+def test_masked_categories_are_never_sampled_and_weigh_nothing():
+    layout = action_layout(spaces.MultiDiscrete([3, 2]))
+    mask = torch.tensor([[True, False, True, False, True]]).expand(5000, 5)
+    distribution = Distribution(layout, torch.zeros(5000, 5), None, mask)
+    noise = torch.rand(5000, 2)
+    noise[0] = 1.0 - 1e-8  # rounding at the edge of the distribution
+    actions = distribution.sample(noise)
+    assert set(actions[:, 0].tolist()) == {0.0, 2.0}
+    assert set(actions[:, 1].tolist()) == {1.0}
+    assert float(distribution.entropy()[0]) == pytest.approx(math.log(2), abs=1e-6)
+    assert float(distribution.logp(actions)[0]) == pytest.approx(math.log(0.5), abs=1e-6)
+
+
+def test_frequencies_follow_the_probabilities():
+    layout = action_layout(spaces.Tuple((spaces.Discrete(3), spaces.MultiBinary(1))))
+    logits = torch.log(torch.tensor([[0.2, 0.5, 0.3, 0.0]]))
+    logits[0, 3] = math.log(0.7 / 0.3)
+    distribution = Distribution(layout, logits.expand(40_000, 4))
+    actions = distribution.sample(torch.rand(40_000, 2, generator=torch.Generator().manual_seed(0)))
+    shares = [float((actions[:, 0] == k).float().mean()) for k in range(3)]
+    assert shares == pytest.approx([0.2, 0.5, 0.3], abs=0.01)
+    assert float(actions[:, 1].mean()) == pytest.approx(0.7, abs=0.01)
