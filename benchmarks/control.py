@@ -46,6 +46,18 @@ TASKS: list[tuple[str, str, int, int, str]] = [
     ("Hopper-v5", "ppo", 1_000_000, 5, "2,480"),
     ("Walker2d-v5", "ppo", 1_000_000, 5, "3,410"),
 ]
+# stable-baselines3's zoo: one tuned agent a task, deterministic evaluation; older versions of some tasks
+PEERS = {
+    "CartPole-v1": "500",
+    "Acrobot-v1": "-73.5 (1M)",
+    "MountainCarContinuous-v0": "88.3 (20k)",
+    "Pendulum-v1": "-172.2 (100k)",
+    "LunarLander-v3": "242.1 (v2)",
+    "LunarLanderContinuous-v3": "270.9 (v2)",
+    "HalfCheetah-v5": "5,819 (v3); CleanRL 1,443 (v4)",
+    "Hopper-v5": "2,410 (v3)",
+    "Walker2d-v5": "3,479 (v3)",
+}
 FLAGS = {"reinforce-plain": ["--algorithm", "reinforce", "--no-baseline"]}
 
 
@@ -128,8 +140,8 @@ def measure(task: str, algorithm: str, steps: int, seeds: int, goal: str, jobs: 
 def table() -> str:
     """The Markdown table of all committed results."""
     lines = [
-        "| task | algorithm | steps | goal (mean) | mean of seeds ± 95 % | worst seed | seeds |",
-        "|---|---|---|---|---|---|---|",
+        "| task | algorithm | steps | mean of seeds ± 95 % | worst seed | seeds | goal | SB3 zoo, one agent |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for task, algorithm, steps, _, goal in TASKS:
         path = RESULTS / f"{task}-{algorithm}.json"
@@ -137,9 +149,10 @@ def table() -> str:
             continue
         row = json.loads(path.read_text())
         score = f"**{row['mean']:,.1f}** ± {row['ci95']:,.1f}"
+        peer = PEERS[task] if algorithm == "ppo" else ""
         lines.append(
-            f"| {task} | {algorithm} | {steps:,} | {goal} | {score} | {row['min']:,.1f} | {len(row['runs'])} "
-            "|"
+            f"| {task} | {algorithm} | {steps:,} | {score} | {row['min']:,.1f} | {len(row['runs'])} | {goal} | "
+            f"{peer} |"
         )
     return "\n".join(lines)
 
