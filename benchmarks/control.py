@@ -140,7 +140,7 @@ def measure(task: str, algorithm: str, steps: int, seeds: int, goal: str, jobs: 
 def table() -> str:
     """The Markdown table of all committed results."""
     lines = [
-        "| task | algorithm | steps | mean of seeds ± 95 % | worst seed | seeds | goal | SB3 zoo, one agent |",
+        "| task | algorithm | steps | mean of seeds ± 95 % | worst seed | seeds | goal | SB3 zoo (one) |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for task, algorithm, steps, _, goal in TASKS:
@@ -151,8 +151,8 @@ def table() -> str:
         score = f"**{row['mean']:,.1f}** ± {row['ci95']:,.1f}"
         peer = PEERS[task] if algorithm == "ppo" else ""
         lines.append(
-            f"| {task} | {algorithm} | {steps:,} | {score} | {row['min']:,.1f} | {len(row['runs'])} | {goal} | "
-            f"{peer} |"
+            f"| {task} | {algorithm} | {steps:,} | {score} | {row['min']:,.1f} | "
+            f"{len(row['runs'])} | {goal} | {peer} |"
         )
     return "\n".join(lines)
 
