@@ -35,10 +35,12 @@ TRANSPORT = "multiprocessing hands the user's own live factory to a worker when 
 CACHE = "numba's compile cache, in the user's cache directory, 0700, can be switched off"
 NAMED_BY_THE_USER = "--env-module: code named on the command line"
 OWN_NAMES = "imports the package's own modules, whose names stand in its source"
+SCIPY = "loads scipy's own BLAS extension from where scipy is installed"
 EXCEPTIONS = {
     ("control/workers.py", "CloudpickleWrapper"): TRANSPORT,
     ("control/workers.py", "multiprocessing"): TRANSPORT,
-    ("control/engine/compiled.py", "cache="): CACHE,
+    ("control/engine/cache.py", "pickle"): CACHE,
+    ("control/engine/compiled.py", "exec_module"): SCIPY,
     ("cli.py", "import_module"): NAMED_BY_THE_USER,
     ("cli.py", "exec_module"): NAMED_BY_THE_USER,
     ("cli.py", "spec_from_file_location"): NAMED_BY_THE_USER,
