@@ -246,13 +246,16 @@ class VectorCopies:
         copies = getattr(env, "envs", None)
         if copies:
             return callable(getattr(copies[0].unwrapped, "action_masks", None))
-        if not hasattr(env, "call_async"):
+        makers = getattr(
+            env, "env_fns", None
+        )  # copies in other processes: asking one that has none breaks it
+        if not makers:
             return False
-        try:  # copies in other processes can only be asked
-            env.call("action_masks")
-        except Exception:  # whatever they raise says that they have none
-            return False
-        return True
+        probe = makers[0]()
+        try:
+            return callable(getattr(probe.unwrapped, "action_masks", None))
+        finally:
+            probe.close()
 
     def _masks(self, observations: Any, infos: dict[str, Any], idle: np.ndarray | None) -> np.ndarray | None:
         """The action masks; rows in ``idle`` (whose next action is not used) allow everything."""
