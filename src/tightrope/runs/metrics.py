@@ -110,7 +110,7 @@ _TABLE = (
         "train/value_loss",
         "return^2",
         "down",
-        "Mean squared error of the critic before value_weight; rises with the returns as a policy learns.",
+        "Half the critic's mean squared error; rises with the returns as a policy learns.",
     ),
     _metric(
         "train/entropy",
