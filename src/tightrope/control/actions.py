@@ -23,6 +23,11 @@ class Component:
     column: int  # first of its columns in the action matrix
     mask: int  # first of its entries in the flat mask; -1 for gaussian
 
+    @property
+    def width(self) -> int:
+        """How many columns of the action matrix it has: one index, or one a bit or dimension."""
+        return 1 if self.kind == "categorical" else self.count
+
 
 @dataclass(frozen=True, eq=False)
 class ActionLeaf:

@@ -63,7 +63,7 @@ class Agent:
         **values: Any,
     ) -> None:
         self.settings = settings or resolve(env, self.algorithm, values)
-        self.env, self._own = env, policy
+        self.env = env
         self.environments = _environments(env, self.settings)
         present = self.settings
         torch_device = torch.device(present.device)
@@ -190,9 +190,7 @@ class Agent:
             if len(blocked := actions.blocked_rows(flat_mask)):
                 raise ValueError(f"action_masks forbid every choice in row {blocked[0]}; allow at least one.")
             inputs = {**inputs, "action_mask": flat_mask}
-        tensors = {
-            k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()
-        }
+        tensors = self.policy.tensors(inputs)
         if deterministic:
             chosen = self.policy.mode(tensors)
         else:
@@ -206,9 +204,7 @@ class Agent:
         layout = self.environments.observation_layout
         batched = _is_batched(layout, observation)
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
-        tensors = {
-            k: torch.from_numpy(np.ascontiguousarray(x)).to(self.policy.device) for k, x in inputs.items()
-        }
+        tensors = self.policy.tensors(inputs)
         with torch.no_grad():
             values = self.policy.values(tensors).cpu().numpy()
         values = values * (

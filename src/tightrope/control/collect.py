@@ -75,7 +75,7 @@ class Collector:
         self.environments, self.normalisers, self.rng = environments, normalisers, rng
         self._rollout: Rollout | None = None
         self._uniform = np.concatenate(
-            [np.full(_columns(c), c.kind != "gaussian") for c in environments.action_layout.components]
+            [np.full(c.width, c.kind != "gaussian") for c in environments.action_layout.components]
         )
         self._step_count = 0
 
@@ -189,10 +189,6 @@ class Collector:
             self._returns[row] -= totals[-1]
             self._lengths[row] -= counts[-1]
         return [episode[1:] for episode in sorted(found, key=lambda episode: episode[0])]
-
-
-def _columns(component: Any) -> int:
-    return 1 if component.kind == "categorical" else component.count
 
 
 def next_values(values: Array, rollout: Rollout, engine: Any) -> Array:

@@ -41,7 +41,7 @@ class Distribution:
         """Actions [N, A] made of the given noise [N, A]."""
         parts = []
         for component in self.layout.components:
-            u = noise[:, component.column : component.column + _columns(component)]
+            u = noise[:, component.column : component.column + component.width]
             if component.kind == "gaussian":
                 mean, log_std = self._gaussian(component)
                 parts.append(mean + log_std.exp() * u)
@@ -69,7 +69,7 @@ class Distribution:
         """
         total = torch.zeros(len(actions), device=actions.device)
         for component in self.layout.components:
-            x = actions[:, component.column : component.column + _columns(component)]
+            x = actions[:, component.column : component.column + component.width]
             if component.kind == "gaussian":
                 mean, log_std = self._gaussian(component)
                 z = (x - mean) * (-log_std).exp()
@@ -131,10 +131,6 @@ class Distribution:
 def gaussian_dimensions(layout: ActionLayout) -> int:
     """How many Gaussian columns the layout has in all."""
     return sum(c.count for c in layout.components if c.kind == "gaussian")
-
-
-def _columns(component: Component) -> int:
-    return 1 if component.kind == "categorical" else component.count
 
 
 def _gaussian_offset(layout: ActionLayout, component: Component) -> int:

@@ -65,7 +65,7 @@ class TorchEngine:
         for name, x in inputs.items():
             seen = normaliser(x[rows]) if normaliser is not None and name == "flat" else x[rows]
             rollout.inputs[name][rows, t] = seen
-        tensors = self._tensors({name: rollout.inputs[name][rows, t] for name in rollout.inputs})
+        tensors = self.policy.tensors({name: rollout.inputs[name][rows, t] for name in rollout.inputs})
         chosen = self.policy.act(tensors, torch.from_numpy(noise[rows]).to(self.device), rows)
         rollout.actions[rows, t], rollout.logp[rows, t] = (x.cpu().numpy() for x in chosen)
 
@@ -75,7 +75,8 @@ class TorchEngine:
         total = len(next(iter(inputs.values())))
         size = 1024 if any(name.startswith("image") for name in inputs) else total
         parts = [
-            self._tensors({n: x[i : i + size] for n, x in inputs.items()}) for i in range(0, total, size)
+            self.policy.tensors({n: x[i : i + size] for n, x in inputs.items()})
+            for i in range(0, total, size)
         ]
         return torch.cat([self.policy.values(part) for part in parts]).float().cpu().numpy()
 
@@ -112,9 +113,6 @@ class TorchEngine:
     def check(self, batch: Batch, settings: UpdateSettings) -> str:
         """Nothing to check: this is what the compiled engine is checked against."""
         return ""
-
-    def _tensors(self, inputs: dict[str, Array]) -> dict[str, torch.Tensor]:
-        return {name: torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for name, x in inputs.items()}
 
 
 class CompiledEngine:

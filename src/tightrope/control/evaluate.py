@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from tightrope.control import tasks
 from tightrope.control.environments import Environments, make_environments
@@ -60,7 +59,7 @@ def act(
     if action_mask is not None:
         inputs = {**inputs, "action_mask": action_mask}
     policy = agent.policy
-    tensors = {k: torch.from_numpy(np.ascontiguousarray(x)).to(policy.device) for k, x in inputs.items()}
+    tensors = policy.tensors(inputs)
     if rng is None:
         return policy.mode(tensors).cpu().numpy()
     rows = len(next(iter(inputs.values())))

@@ -131,6 +131,10 @@ class Policy(nn.Module):
         """Where the parameters lie."""
         return next(self.parameters()).device
 
+    def tensors(self, arrays: dict[str, np.ndarray]) -> Inputs:
+        """Encoded observations as tensors where the parameters lie."""
+        return {name: torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for name, x in arrays.items()}
+
     def critic_parameters(self) -> list[nn.Parameter]:
         """The parameters that only the critic uses; empty for a user's own module."""
         return list(self.critic.parameters()) if self.critic is not None else []

@@ -248,8 +248,7 @@ def backward(flat, grad, layers, first, last, work, n, more, join):
     """Gradients of layers last - 1 .. first from the DELTA of the last one (by its value).
 
     ``more``: add to the gradients (not the minibatch's first block). ``join``: add to the DELTA of the layer
-    that
-    feeds the first one (the critic's share of a trunk, after the actor's) and do not begin it.
+    that feeds the first one (the critic's share of a trunk, after the actor's) and do not begin it.
     """
     for layer in range(last - 1, first - 1, -1):
         descend(layers, layer, work, n)
