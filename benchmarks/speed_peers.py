@@ -1,9 +1,13 @@
-"""The peers' side of speed.py: one training run of stable-baselines3 or sbx, in the peers' own interpreter.
+"""The peers' side of speed.py: one training run of a peer, in the peers' own interpreter.
 
     python speed_peers.py stable-baselines3 '{"env": "CartPole-v1", "num_envs": 8, ...}' RESULT.json
 
 This file imports nothing of tightrope. It writes steps and optimiser steps (as the optimiser itself counted
 them); the wall time is taken from outside. ``speed_peers.py versions RESULT.json`` writes what is installed.
+
+PureJaxRL is not a package: the environment variable PUREJAXRL names the folder that holds its ppo.py. Its
+whole run is one compiled call, environment included, and it writes the seconds of that call alone, so that
+neither its start nor its compilation counts.
 """
 
 from __future__ import annotations
@@ -12,14 +16,18 @@ import importlib
 import importlib.metadata
 import importlib.util
 import json
+import os
 import sys
 import tempfile
+import time
+import types
 from pathlib import Path
 from typing import Any
 
 PACKAGES = {  # name -> module, distributions whose versions matter
     "stable-baselines3": ("stable_baselines3", ("stable-baselines3", "torch", "gymnasium", "numpy")),
     "sbx": ("sbx", ("sbx-rl", "jax", "stable-baselines3", "gymnasium")),
+    "purejaxrl": ("gymnax", ("gymnax", "jax", "flax", "optax")),
 }
 
 
@@ -28,7 +36,7 @@ def installed() -> dict[str, dict[str, str]]:
     return {
         peer: {name: importlib.metadata.version(name) for name in names}
         for peer, (module, names) in PACKAGES.items()
-        if importlib.util.find_spec(module) is not None
+        if importlib.util.find_spec(module) is not None and (peer != "purejaxrl" or "PUREJAXRL" in os.environ)
     }
 
 
@@ -73,10 +81,62 @@ def train(peer: str, scenario: dict[str, Any], total_steps: int) -> dict[str, An
     return {"steps": model.num_timesteps, "optimiser_steps": count}
 
 
+class _Absent(types.ModuleType):
+    """Stands for a package that PureJaxRL's wrappers import for tasks that are not run here."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return type(name, (), {})
+
+
+def train_purejaxrl(scenario: dict[str, Any], total_steps: int) -> dict[str, Any]:
+    """PureJaxRL's ppo.py as it is published, with the scenario's settings; its value loss is always
+    clipped.
+    """
+    import jax
+
+    for name in ("brax", "brax.envs", "brax.envs.wrappers", "brax.envs.wrappers.training", "navix"):
+        sys.modules[name] = _Absent(name)
+    if not hasattr(jax, "tree_map"):
+        jax.tree_map = jax.tree.map
+    sys.path.insert(0, os.environ["PUREJAXRL"])
+    ppo = importlib.import_module("ppo")
+    num_envs, num_steps, size = (scenario[name] for name in ("num_envs", "num_steps", "minibatch_size"))
+    config = {
+        "LR": scenario["learning_rate"],
+        "NUM_ENVS": num_envs,
+        "NUM_STEPS": num_steps,
+        "TOTAL_TIMESTEPS": total_steps,
+        "UPDATE_EPOCHS": scenario["num_epochs"],
+        "NUM_MINIBATCHES": num_envs * num_steps // size,
+        "GAMMA": scenario["gamma"],
+        "GAE_LAMBDA": scenario["gae_lambda"],
+        "CLIP_EPS": 0.2,
+        "ENT_COEF": scenario["entropy_weight"],
+        "VF_COEF": 0.5,
+        "MAX_GRAD_NORM": 0.5,
+        "ACTIVATION": "tanh",
+        "ENV_NAME": scenario["env"],
+        "ANNEAL_LR": False,
+        "DEBUG": False,
+    }
+    key = jax.random.PRNGKey(scenario["seed"])
+    compiled = jax.jit(ppo.make_train(config)).lower(key).compile()
+    begin = time.perf_counter()
+    out = jax.block_until_ready(compiled(key))
+    seconds = time.perf_counter() - begin
+    state = out["runner_state"][0]
+    return {"steps": total_steps, "optimiser_steps": int(state.step), "call_seconds": seconds}
+
+
 def main(words: list[str]) -> None:
     """Run what the command line says and write the result file."""
     if words[0] == "versions":
         result: Any = installed()
+    elif words[0] == "purejaxrl":
+        scenario = json.loads(words[1])
+        result = train_purejaxrl(scenario, scenario["total_steps"])
     else:
         scenario = json.loads(words[1])
         result = train(words[0], scenario, scenario["total_steps"])

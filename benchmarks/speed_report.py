@@ -11,17 +11,6 @@ from typing import Any
 
 MATRIX = 64  # the floor's unit of work: single-precision products of MATRIX x MATRIX x MATRIX
 PARTS = ("env", "act", "advantages", "update", "rest")
-# Figures of others that this benchmark does not run itself: measured earlier, on the same kind of machine.
-PUBLISHED = {
-    "cartpole-small": "59,000",
-    "cartpole-zoo": "31,000-41,000",
-    "cartpole-large": "129,000",
-}
-PUBLISHED_SOURCE = (
-    "PureJaxRL's published ppo.py (jax 0.10.2, gymnax 0.0.8, environment compiled too, 2 threads, no entropy "
-    "term), total steps / time of the compiled call, was measured earlier on two cores of an AMD EPYC "
-    "(Zen 4): the same kind of machine, not this run"
-)
 
 
 def tightrope_settings(scenario: dict[str, Any]) -> dict[str, Any]:
@@ -174,19 +163,12 @@ def _settings_text(s: dict[str, Any]) -> str:
 def speed_table(results: dict[str, Any]) -> str:
     """Median steps/s of everybody, and our ratio to each peer: median over the pairs (smallest-largest)."""
     peers = list(results["peers"])
-    head = [
-        "scenario",
-        "environment",
-        "envs x steps, minibatch, epochs",
-        "tightrope",
-        *peers,
-        "PureJaxRL (published)",
-    ]
+    head = ["scenario", "environment", "envs x steps, minibatch, epochs", "tightrope", *peers]
     rows = []
     for s in results["scenarios"]:
         row = [s["name"], s["env"], _settings_text(s), _number(s["rates"]["tightrope"])]
         row += [_number(s["rates"].get(peer)) for peer in peers]
-        rows.append([*row, PUBLISHED.get(s["name"], "-"), *(_ratio_text(s["ratios"].get(p)) for p in peers)])
+        rows.append([*row, *(_ratio_text(s["ratios"].get(p)) for p in peers)])
     return table([*head, *(f"ratio to {peer}" for peer in peers)], rows)
 
 
@@ -246,8 +228,6 @@ def speed_text(results: dict[str, Any]) -> str:
             "Steps/s of the whole training loop, medians; ratios are medians over pairs (smallest-largest):",
             "",
             speed_table(results),
-            "",
-            f"{PUBLISHED_SOURCE}.",
             "",
             "Where our time goes, in microseconds per step of all environments of a scenario, and one",
             "minibatch update beside its floor (the matrix products alone, on one core, at the",

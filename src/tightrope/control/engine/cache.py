@@ -121,7 +121,7 @@ def store(folder: Path, function: Any, dispatcher: Any) -> None:
         (result,) = dispatcher.overloads.values()
         if result.library.has_dynamic_globals:
             return  # addresses of this process
-        data = serialize.dumps(result._reduce())
+        data = serialize.dumps(_without_bitcode(result._reduce()))
         number, name = tempfile.mkstemp(dir=folder)  # 0600; other processes see all of the file or none
         try:
             with open(number, "wb") as file:
@@ -130,6 +130,17 @@ def store(folder: Path, function: Any, dispatcher: Any) -> None:
         except BaseException:
             os.unlink(name)
             raise
+
+
+def _without_bitcode(state: Any) -> Any:
+    """The same with a module of names alone in place of the one that other functions would be linked with:
+    none ever is, and as LLVM reads it anew in each process it takes more memory than all our code.
+    """
+    name, kind, (code, bitcode) = state[0]
+    module = llvm.parse_bitcode(bitcode)
+    defined = [x.name for x in (*module.functions, *module.global_variables) if not x.is_declaration]
+    names = llvm.parse_assembly("\n".join(f'@"{x}" = global i64 0' for x in defined))
+    return ((name, kind, (code, names.as_bitcode())), *state[1:])
 
 
 def _file(folder: Path, function: Any) -> Path:
