@@ -172,6 +172,20 @@ def speed_table(results: dict[str, Any]) -> str:
     return table([*head, *(f"ratio to {peer}" for peer in peers)], rows)
 
 
+def short_text(results: dict[str, Any]) -> str:
+    """Steps/s of everybody and our ratio to each, for the README."""
+    peers = list(results["peers"])
+    head = ["task", "envs x steps, minibatch, epochs", "tightrope", *(f"{p} (ratio)" for p in peers)]
+    rows = []
+    for s in results["scenarios"]:
+        beside = {p: f"{_number(s['rates'][p])} ({found['median']:.1f})" for p, found in s["ratios"].items()}
+        cells = [beside.get(peer, "-") for peer in peers]
+        rows.append([s["env"], _settings_text(s), f"**{_number(s['rates']['tightrope'])}**", *cells])
+    machine = results["machine"]
+    where = f"{machine['cpu']}, {machine['cores']} cores, {results['date']}"
+    return f"{table(head, rows)}\n\nSteps/s, medians; {where}."
+
+
 def breakdown_table(results: dict[str, Any]) -> str:
     """Where our time goes, per step of all environments, and a minibatch update beside its floor."""
     head = [

@@ -6,6 +6,7 @@ A table stands between `<!-- table:NAME -->` and `<!-- end -->`; a test fails wh
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from tightrope.algorithms.settings import range_text
 from tightrope.control.presets import BY_TASK
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 from tightrope.flags import settings_fields
-from tightrope.runs.metrics import METRICS
+from tightrope.runs.declare import Metric
+from tightrope.runs.metrics import FAMILIES, of_story
 
 PAGE = Path(__file__).with_name("control.md")
 
@@ -33,9 +35,19 @@ def shown(value: Any) -> str:
 
 
 def metrics() -> list[str]:
-    """Every metric, from runs/metrics.py."""
+    """Every metric of a control run, from runs/metrics.py."""
+    return _metric_table(of_story("control"))
+
+
+def language_metrics() -> list[str]:
+    """Every metric of a language run, from runs/metrics.py and runs/language_metrics.py."""
+    table = _metric_table(of_story("language"))
+    return table + [row(f"`{m.name}NAME`", m.unit, m.healthy, m.doc) for m in FAMILIES.values()]
+
+
+def _metric_table(metrics: list[Metric]) -> list[str]:
     lines = [row("metric", "unit", "healthy", "meaning"), "|---|---|---|---|"]
-    return lines + [row(f"`{m.name}`", m.unit, m.healthy, m.doc) for m in METRICS.values()]
+    return lines + [row(f"`{m.name}`", m.unit, m.healthy, m.doc) for m in metrics]
 
 
 def presets() -> list[str]:
@@ -59,19 +71,23 @@ def settings() -> list[str]:
 
 
 TABLES = {"metrics": metrics, "presets": presets, "settings": settings}
+LANGUAGE_TABLES = {"metrics": language_metrics}
 
 
-def filled(text: str) -> str:
-    """The page with every table as the code has it now."""
-    for name, build in TABLES.items():
+def filled(text: str, tables: dict[str, Callable[[], list[str]]] = TABLES) -> str:
+    """The text of a page with every table as the code has it now. ValueError unless each has one place."""
+    for name, build in tables.items():
         table = "\n".join([f"<!-- table:{name} -->", "", *build(), "", "<!-- end -->"])
         text, found = re.subn(
             rf"<!-- table:{name} -->.*?<!-- end -->", lambda _, t=table: t, text, flags=re.S
         )
         if found != 1:
-            raise ValueError(f"{PAGE.name} has {found} places for the table {name!r}, expected one.")
+            raise ValueError(f"The page has {found} places for the table {name!r}, expected one.")
     return text
 
 
+PAGES = {PAGE: TABLES, PAGE.with_name("rlhf.md"): LANGUAGE_TABLES}
+
 if __name__ == "__main__":
-    PAGE.write_text(filled(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page, tables in PAGES.items():
+        page.write_text(filled(page.read_text(encoding="utf-8"), tables), encoding="utf-8")

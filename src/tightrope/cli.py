@@ -49,6 +49,10 @@ def train(words: list[str]) -> int:
 def resume(words: list[str]) -> int:
     """``tightrope resume RUN``: go on from the newest checkpoint."""
     given = resume_parser().read(words)
+    if _is_language(given["run"]):
+        from tightrope.cli_language import resume as resume_language
+
+        return resume_language(given)
     _import_named(given.get("env_module"))
 
     def run(report: Any) -> dict[str, Any]:
@@ -58,6 +62,13 @@ def resume(words: list[str]) -> int:
         return run_training(given["run"], total_steps=total_steps, report=report, env=env)
 
     return _watched(run, given)
+
+
+def _is_language(run: str) -> bool:
+    """Whether a run folder is one of the language story."""
+    from tightrope.runs.run import Run
+
+    return "env" not in Run.open(run).settings
 
 
 def evaluate(words: list[str]) -> int:
@@ -95,11 +106,27 @@ def record(words: list[str]) -> int:
     return 0
 
 
+def _language(name: str) -> Callable[[list[str]], int]:
+    """A command of the language story, whose module is imported when it is used."""
+
+    def command(words: list[str]) -> int:
+        from tightrope import cli_language
+
+        return int(getattr(cli_language, name)(words))
+
+    return command
+
+
 COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "train": (train, "ENV   train a policy on a Gymnasium task"),
     "evaluate": (evaluate, "RUN   episodes with the saved policy: mean, deviation, 95 % interval"),
     "record": (record, "RUN   an mp4 of the saved policy"),
     "resume": (resume, "RUN   go on from the newest checkpoint"),
+    "sft": (_language("sft"), "--data FILE   fine-tune a language model"),
+    "reward": (_language("reward"), "--data FILE   train a reward model on preference pairs"),
+    "align": (_language("align"), "--data FILE --reward R   PPO on a language model"),
+    "sample": (_language("sample"), "RUN   responses of the aligned model beside the reference's"),
+    "doctor": (_language("doctor"), "check this installation; --model M: a language model"),
 }
 
 

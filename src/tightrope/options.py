@@ -146,7 +146,17 @@ def resume_parser() -> Parser:
         "--total-steps",
         type=_at_least_one,
         metavar="N",
-        help="A new end; also continues a finished run (default: the run's own).",
+        help="A new end (language: responses); also continues a finished run (default: the run's own).",
+    )
+    group.add_argument(
+        "--reward",
+        metavar="R",
+        help="align: the reward again, where it was your own code (default: the run's).",
+    )
+    group.add_argument(
+        "--data",
+        metavar="FILE",
+        help="align: the prompts again, where they were no file (default: the run's).",
     )
     _common(parser, run=True)
     return parser

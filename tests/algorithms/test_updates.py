@@ -13,6 +13,7 @@ from algorithms.models import TinyModel, make_batch
 from tightrope.algorithms import a2c, ppo, reinforce
 from tightrope.algorithms.optimise import NonFiniteError, SamplingMismatch, make_optimiser
 from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings
+from tightrope.maths.statistics import masked_mean
 
 RULES = [
     (ppo, PPOSettings(num_epochs=1, minibatch_size=1000)),
@@ -186,7 +187,7 @@ def test_one_joint_norm_limits_all_gradients():
 
 
 def test_extra_loss_joins_the_loss_and_its_metrics():
-    def pull(model, part, evaluation):
+    def pull(model, part, evaluation, count):
         return 10.0 * model.actor.bias.square().sum(), {"entropy": torch.zeros(part.mask.shape)}
 
     model, metrics = run(
@@ -195,6 +196,25 @@ def test_extra_loss_joins_the_loss_and_its_metrics():
     plain, plain_metrics = run(ppo, PPOSettings(num_epochs=20, minibatch_size=24, learning_rate=1e-2))
     assert model.actor.bias.norm() < 0.5 * plain.actor.bias.norm()
     assert metrics["train/entropy"] == pytest.approx(plain_metrics["train/entropy"] / 2, rel=0.2)
+
+
+@pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
+@pytest.mark.parametrize("micro", [None, 1, 5, 24])
+def test_extra_loss_is_told_the_count_of_the_whole_minibatch(rule, settings, micro):
+    """With it a loss that is a sum over steps has the scale of the rest, and micro-batches change nothing."""
+    batch = make_batch(TinyModel(), rows=24, columns=3, masked=0.4)
+    counts = []
+
+    def entropy_again(model, part, evaluation, count):
+        counts.append(int(count))
+        return -0.5 * masked_mean(evaluation.entropy, part.mask, count), {}
+
+    settings = dataclasses.replace(settings, micro_batch_size=micro)
+    extra, _ = run(rule, settings, batch=batch, extra_loss=entropy_again)
+    assert set(counts) == {int(batch.mask.sum())} and len(counts) == (1 if micro is None else -(-24 // micro))
+    built_in, _ = run(rule, dataclasses.replace(settings, entropy_weight=0.5), batch=batch)
+    assert distance(extra, built_in) < 2e-6
+    assert distance(extra, run(rule, settings, batch=batch)[0]) > 1e-5
 
 
 def test_refresh_is_called_before_each_later_epoch_when_asked():

@@ -34,6 +34,7 @@ KEYWORDS = {"allow_pickle", "trust_remote_code"}
 TRANSPORT = "multiprocessing hands the user's own live factory to a worker when it starts"
 CACHE = "numba's compile cache, in the user's cache directory, 0700, can be switched off"
 NAMED_BY_THE_USER = "--env-module: code named on the command line"
+REWARD_NAMED_BY_THE_USER = "--reward FILE.py:function: code named on the command line"
 OWN_NAMES = "imports the package's own modules, whose names stand in its source"
 SCIPY = "loads scipy's own BLAS extension from where scipy is installed"
 EXCEPTIONS = {
@@ -44,7 +45,10 @@ EXCEPTIONS = {
     ("cli.py", "import_module"): NAMED_BY_THE_USER,
     ("cli.py", "exec_module"): NAMED_BY_THE_USER,
     ("cli.py", "spec_from_file_location"): NAMED_BY_THE_USER,
+    ("language/rewards.py", "exec_module"): REWARD_NAMED_BY_THE_USER,
+    ("language/rewards.py", "spec_from_file_location"): REWARD_NAMED_BY_THE_USER,
     ("__init__.py", "import_module"): OWN_NAMES,
+    ("language/__init__.py", "import_module"): OWN_NAMES,
 }
 
 

@@ -15,6 +15,7 @@ from tightrope.flags import PEER_NAMES
 NEVER = {"done", "dones", "is_done", "all_done"}
 # words of the peers that also have an everyday meaning and may name something else
 EVERYDAY = {"epochs", "horizon", "epsilon", "discount", "cuda", "lambda", "normalize", "gae"}
+EVERYDAY |= {"batch_size", "whiten_rewards"}  # language: responses an iteration; rewards over their deviation
 UNFINISHED = re.compile("|".join(["TO" + "DO", "FIX" + "ME", "XX" + "X", r"\bHA" + r"CK\b"]))
 
 

@@ -44,6 +44,16 @@ def lambda_0_is_the_td_error(maths: ModuleType, c: Case) -> None:
     close(maths.returns.gae(*arguments, c.ended, c.gamma, 0.0, c.mask), one_step)
 
 
+def every_row_may_have_a_lambda_of_its_own(maths: ModuleType, c: Case) -> None:
+    parts = (c.rewards, c.values, c.next_values, c.terminated, c.ended)
+    lambdas = torch.rand(len(c.rewards), generator=c.generator, dtype=torch.float64)
+    together = maths.returns.gae(*parts, c.gamma, lambdas, c.mask)
+    for row, own in enumerate(lambdas.tolist()):
+        here = slice(row, row + 1)
+        alone = maths.returns.gae(*(part[here] for part in parts), c.gamma, own, c.mask[here])
+        same(together[here], alone)
+
+
 def lambda_1_is_monte_carlo(maths: ModuleType, c: Case) -> None:
     """The values cancel between one TD error and the next, and the discounted rewards are left."""
     following = maths.returns.next_values(c.values, c.last_values, c.ended, c.final_values)
@@ -144,6 +154,7 @@ PROPERTIES = (
     td_errors_follow_their_equation,
     gae_is_the_discounted_sum_of_td_errors,
     lambda_0_is_the_td_error,
+    every_row_may_have_a_lambda_of_its_own,
     lambda_1_is_monte_carlo,
     discounted_returns_are_discounted_sums,
     without_bootstrap_the_future_is_0,

@@ -59,6 +59,12 @@ MUTANTS = (
     ),
     Mutant("lambda is missing from the trace", "returns.py", "gamma * gae_lambda * torch", "gamma * torch"),
     Mutant(
+        "all rows have the lambda of the first",
+        "returns.py",
+        "gae_lambda.to(rewards)",
+        "gae_lambda[0].to(rewards)",
+    ),
+    Mutant(
         "gamma is missing from the trace", "returns.py", "gamma * gae_lambda * torch", "gae_lambda * torch"
     ),
     Mutant(

@@ -26,6 +26,14 @@ def test_gae_by_hand() -> None:
     assert gae(REWARDS, VALUES, FOLLOWING, NEVER, NEVER, 0.5, 0.5).tolist() == [[1.6875, 2.75, 3]]
 
 
+def test_lambda_may_differ_from_row_to_row() -> None:
+    # the first row as above;  with lambda 0 the TD errors are left;  the dtype is that of the rewards
+    parts = [part.expand(2, 3) for part in (REWARDS, VALUES, FOLLOWING, NEVER, NEVER)]
+    result = gae(*parts, 0.5, torch.tensor([0.5, 0.0], dtype=torch.float64))
+    assert result.tolist() == [[1.6875, 2.75, 3], [1, 2, 3]]
+    assert result.dtype == REWARDS.dtype
+
+
 def test_a_truncation_keeps_the_value_and_drops_the_trace() -> None:
     # A3 = 3;  A2 = 2, no trace;  A1 = 1 + 0.25 * 2 = 1.5
     assert gae(REWARDS, VALUES, FOLLOWING, NEVER, SECOND, 0.5, 0.5).tolist() == [[1.5, 2, 3]]
@@ -78,6 +86,10 @@ def test_broadcasting_is_refused() -> None:
         gae(REWARDS, VALUES, FOLLOWING, NEVER, NEVER.T, 0.5, 0.5)
     with pytest.raises(ValueError, match=r"mask \(3,\)"):
         gae(REWARDS, VALUES, FOLLOWING, NEVER, NEVER, 0.5, 0.5, NEVER[0])
+    with pytest.raises(ValueError, match=r"gae_lambda \(3,\)"):
+        gae(REWARDS, VALUES, FOLLOWING, NEVER, NEVER, 0.5, torch.zeros(3))
+    with pytest.raises(ValueError, match=r"gae_lambda \(1, 1\)"):
+        gae(REWARDS, VALUES, FOLLOWING, NEVER, NEVER, 0.5, torch.zeros(1, 1))
     with pytest.raises(ValueError, match=r"bootstrap \(1,\)"):
         discounted_returns(REWARDS, NEVER, 0.5, torch.tensor([0.0]))
     with pytest.raises(ValueError, match=r"last_values \(1, 1\)"):

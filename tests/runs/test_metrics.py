@@ -6,7 +6,8 @@ import re
 
 import pytest
 
-from tightrope.runs.metrics import METRICS, check_names
+from tightrope.runs.language_metrics import LANGUAGE_TABLE
+from tightrope.runs.metrics import _TABLE, FAMILIES, METRICS, check_names, of_story
 
 KNOWN_TO_USERS = [
     "rollout/ep_rew_mean",
@@ -41,15 +42,54 @@ KNOWN_TO_USERS = [
     "time/update_seconds",
 ]
 
+LANGUAGE = [
+    "objective/kl",
+    "objective/kl_k2",
+    "objective/kl_k3",
+    "objective/kl_exact",
+    "objective/kl_token_mean",
+    "objective/kl_beta",
+    "objective/scores",
+    "objective/scores_std",
+    "objective/rlhf_reward",
+    "objective/non_score_reward",
+    "objective/entropy",
+    "objective/entropy_token_mean",
+    "objective/response_length",
+    "objective/eos_fraction",
+    "objective/truncated_fraction",
+    "objective/masked_samples",
+    "objective/distinct_2",
+    "objective/gold",
+    "objective/gold_predicted_peak_kl",
+    "objective/sampling_gap",
+    "train/kl_loss",
+    "train/ptx_loss",
+    "time/generate_seconds",
+    "time/score_seconds",
+    "time/tokens_per_second",
+    "sft/loss",
+    "sft/held_out_loss",
+    "sft/learning_rate",
+    "sft/grad_norm",
+    "sft/tokens",
+    "reward/loss",
+    "reward/accuracy",
+    "reward/held_out_accuracy",
+    "reward/calibration_error",
+    "reward/margin",
+    "eval/gold",
+]
+
 
 def test_every_promised_name_is_declared() -> None:
-    assert set(KNOWN_TO_USERS) <= set(METRICS)
+    assert set(KNOWN_TO_USERS) | set(LANGUAGE) <= set(METRICS)
 
 
 @pytest.mark.parametrize("name", METRICS)
 def test_every_entry_is_complete(name: str) -> None:
     metric = METRICS[name]
-    assert re.fullmatch(r"[a-z]+/[a-z_]+", name)
+    assert re.fullmatch(r"[a-z]+/[a-z_0-9]+", name)
     assert metric.name == name
     assert metric.unit
     assert metric.doc.endswith(".")
@@ -68,3 +108,28 @@ def test_a_name_outside_the_table_is_refused_with_the_near_one() -> None:
     with pytest.raises(ValueError, match="not a declared metric"):
         check_names(["loss"])
     check_names(METRICS)
+
+
+def test_each_story_has_its_own_table() -> None:
+    control = [metric.name for metric in of_story("control")]
+    language = [metric.name for metric in of_story("language")]
+    assert set(control) == set(KNOWN_TO_USERS)
+    assert set(LANGUAGE) <= set(language)
+    assert not set(LANGUAGE) & set(control)
+    assert set(control) | set(language) == set(METRICS)
+    assert {"train/approx_kl", "train/value_loss", "time/seconds"} <= set(language)
+    assert not [name for name in language if name.startswith("rollout/")]
+
+
+def test_no_metric_is_declared_twice() -> None:
+    assert len(METRICS) == len(_TABLE) + len(LANGUAGE_TABLE)
+
+
+@pytest.mark.parametrize("prefix", FAMILIES)
+def test_a_family_takes_the_users_words_and_not_none(prefix: str) -> None:
+    assert prefix.endswith("/") and FAMILIES[prefix].doc.endswith(".")
+    check_names([f"{prefix}my reward", f"{prefix}x"])
+    with pytest.raises(ValueError, match="not a declared metric"):
+        check_names([prefix])
+    with pytest.raises(ValueError, match="not a declared metric"):
+        check_names([f"un{prefix}x"])

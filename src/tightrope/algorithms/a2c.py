@@ -20,7 +20,7 @@ from tightrope.algorithms.settings import A2CSettings
 from tightrope.maths import statistics, surrogate, values
 
 Model = Callable[[Batch], Evaluation]
-ExtraLoss = Callable[[Model, Batch, Evaluation], tuple[Tensor, dict[str, Tensor]]]
+ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Tensor]]]
 
 
 def update(
@@ -36,8 +36,9 @@ def update(
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout by one step; returns the metrics.
 
-    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced,
-    metrics)``. ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
+    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics [B, T])``:
+    the loss is a sum over the part / ``count``, the counting steps of the whole batch, as the rest is.
+    ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the log-ratios exceed
     ``log_ratio_limit``.
     """
@@ -55,7 +56,7 @@ def update(
         loss = policy + settings.value_weight * value - settings.entropy_weight * now.entropy
         total = statistics.masked_mean(loss, part.mask, count)
         if extra_loss is not None:
-            extra, extra_metrics = extra_loss(model, part, now)
+            extra, extra_metrics = extra_loss(model, part, now, count)
             total = total + extra
             meter.add(part.mask, **extra_metrics)
         total.backward()

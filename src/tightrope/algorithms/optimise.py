@@ -63,6 +63,24 @@ def set_learning_rates(optimiser: torch.optim.Optimizer, settings: UpdateSetting
         group["lr"] = rate
 
 
+def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Adam's moments and step counts, named ``<index of the parameter>.<what>``."""
+    state = optimiser.state_dict()["state"]
+    return {f"{index}.{name}": x for index, entry in state.items() for name, x in entry.items()}
+
+
+def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
+    """Adam's moments, copied in place where they exist: the compiled engine may hold views of them."""
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    for name, saved in tensors.items():
+        index, kind = name.split(".", 1)
+        entry = optimiser.state[parameters[int(index)]]
+        if kind in entry:
+            entry[kind].copy_(saved)
+        else:
+            entry[kind] = saved.to(parameters[int(index)].device).clone()
+
+
 class Meter:
     """Sums over every minibatch of an update, divided once at the end; nothing is read from the device
     before.

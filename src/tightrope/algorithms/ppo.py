@@ -21,7 +21,7 @@ from tightrope.algorithms.settings import PPOSettings
 from tightrope.maths import statistics, surrogate, values
 
 Model = Callable[[Batch], Evaluation]
-ExtraLoss = Callable[[Model, Batch, Evaluation], tuple[Tensor, dict[str, Tensor]]]
+ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Tensor]]]
 
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, settings: PPOSettings) -> Tensor:
@@ -62,8 +62,9 @@ def update(
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout; returns the metrics, means over every minibatch.
 
-    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced,
-    metrics)``; ``refresh(batch) -> batch`` estimates advantages anew when ``recompute_advantages`` is on.
+    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics [B, T])``:
+    the loss is a sum over the part / ``count``, the counting steps of the whole minibatch, as the rest is.
+    ``refresh(batch) -> batch`` estimates advantages anew when ``recompute_advantages`` is on.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the first log-ratios exceed
     ``log_ratio_limit``.
     """
@@ -87,7 +88,7 @@ def update(
                 loss = policy + settings.value_weight * value - settings.entropy_weight * now.entropy
                 total = statistics.masked_mean(loss, part.mask, count)
                 if extra_loss is not None:
-                    extra, extra_metrics = extra_loss(model, part, now)
+                    extra, extra_metrics = extra_loss(model, part, now, count)
                     total = total + extra
                     meter.add(part.mask, **extra_metrics)
                 total.backward()

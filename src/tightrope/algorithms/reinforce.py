@@ -21,7 +21,7 @@ from tightrope.algorithms.settings import ReinforceSettings
 from tightrope.maths import statistics, surrogate, values
 
 Model = Callable[[Batch], Evaluation]
-ExtraLoss = Callable[[Model, Batch, Evaluation], tuple[Tensor, dict[str, Tensor]]]
+ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Tensor]]]
 
 
 def update(
@@ -37,8 +37,9 @@ def update(
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout by one step; returns the metrics.
 
-    ``model(batch) -> Evaluation``; ``extra_loss(model, part, evaluation) -> (loss already reduced,
-    metrics)``. ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
+    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics [B, T])``:
+    the loss is a sum over the part / ``count``, the counting steps of the whole batch, as the rest is.
+    ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the log-ratios exceed
     ``log_ratio_limit``.
     """
@@ -58,7 +59,7 @@ def update(
             loss = loss + settings.value_weight * value
         total = statistics.masked_mean(loss, part.mask, count)
         if extra_loss is not None:
-            extra, extra_metrics = extra_loss(model, part, now)
+            extra, extra_metrics = extra_loss(model, part, now, count)
             total = total + extra
             meter.add(part.mask, **extra_metrics)
         total.backward()

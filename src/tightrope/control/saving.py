@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
 from tightrope.control.agent import AGENTS, Agent, anywhere
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import checkpoint
@@ -15,7 +16,7 @@ from tightrope.runs import checkpoint
 
 def save_agent(agent: Agent, folder: Path, *, extra: dict[str, Any] | None = None) -> Path:
     """Write the agent into ``folder`` as safetensors and JSON; ``extra`` goes into its state."""
-    tensors = {"policy": dict(agent.policy.state_dict()), "optimiser": _optimiser_tensors(agent.optimiser)}
+    tensors = {"policy": dict(agent.policy.state_dict()), "optimiser": optimiser_tensors(agent.optimiser)}
     normalisers = agent.normalisers.state()
     if normalisers:
         tensors["normalisers"] = normalisers
@@ -99,7 +100,7 @@ def agent_folder(path: Path, *, best: bool = False) -> Path:
 def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: dict[str, Any]) -> None:
     """Put saved tensors and counters into an agent of the same settings."""
     agent.policy.load_state_dict(tensors["policy"])
-    _restore_optimiser(agent.optimiser, tensors["optimiser"])
+    restore_optimiser(agent.optimiser, tensors["optimiser"])
     normalisers = dict(tensors.get("normalisers", {}))
     running = normalisers.get("rewards.running")
     if running is not None and len(running) != agent.environments.num_envs:
@@ -108,20 +109,3 @@ def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: di
     agent.steps, agent.kl_beta = int(state["steps"]), state["kl_beta"]
     agent.sampling_rng.bit_generator.state = state["rng"]["sampling"]
     agent.update_rng.bit_generator.state = state["rng"]["update"]
-
-
-def _optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
-    state = optimiser.state_dict()["state"]
-    return {f"{index}.{name}": x for index, entry in state.items() for name, x in entry.items()}
-
-
-def _restore_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, torch.Tensor]) -> None:
-    """Adam's moments, copied in place where they exist: the compiled engine may hold views of them."""
-    parameters = [p for group in optimiser.param_groups for p in group["params"]]
-    for name, saved in tensors.items():
-        index, kind = name.split(".", 1)
-        entry = optimiser.state[parameters[int(index)]]
-        if kind in entry:
-            entry[kind].copy_(saved)
-        else:
-            entry[kind] = saved.to(parameters[int(index)].device).clone()

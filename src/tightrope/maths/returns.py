@@ -51,7 +51,7 @@ def gae(
     terminated: Tensor,
     ended: Tensor,
     gamma: float,
-    gae_lambda: float,
+    gae_lambda: float | Tensor,
     mask: Tensor | None = None,
 ) -> Tensor:
     """Generalised advantage estimates, [B, T].
@@ -59,9 +59,13 @@ def gae(
     A_t = delta_t + gamma * lambda * A_{t+1}, without the second term (the trace) where `ended`, in the last
     column and before a masked step; 0 where masked. lambda 0 is the TD error (biased), lambda 1 is the Monte
     Carlo return minus the value (of high variance). The target of the critic is advantages + values.
-    ValueError when the shapes differ.
+    `gae_lambda` is one number for all, or a tensor [B], one for each row (a response whose lambda follows its
+    length: VAPO, https://arxiv.org/abs/2504.05118). ValueError when the shapes differ.
     """
     require_same_shape(rewards=rewards, ended=ended)
+    if isinstance(gae_lambda, Tensor):
+        require_same_shape(a_column_of_rewards=rewards[:, 0], gae_lambda=gae_lambda)
+        gae_lambda = gae_lambda.to(rewards)
     deltas = td_errors(rewards, values, next_values, terminated, gamma, mask)
     advantages = []
     trace = torch.zeros_like(deltas[:, 0])

@@ -100,6 +100,10 @@ class Run:
         """Append finished episodes, one object each (step, return, length, ...), in one write."""
         self._append("episodes.jsonl", rows)
 
+    def record_samples(self, rows: Iterable[dict[str, Any]]) -> None:
+        """Append responses of a language model, one object each (step, prompt, response, scores, ...)."""
+        self._append("samples.jsonl", rows)
+
     def _append(self, name: str, rows: Iterable[dict[str, Any]]) -> None:
         text = "".join(dumps(row) + "\n" for row in rows)
         if not text:
@@ -125,7 +129,7 @@ class Run:
         Without this a resumed run would list the updates between checkpoint and crash twice.
         """
         self._close_files()
-        for name in ("metrics.jsonl", "episodes.jsonl"):
+        for name in ("metrics.jsonl", "episodes.jsonl", "samples.jsonl"):
             path = self.path / name
             if not path.exists():
                 continue

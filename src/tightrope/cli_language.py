@@ -1,0 +1,285 @@
+"""The commands of the language story: sft, reward, align, sample, doctor."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tightrope.flags import Parser, UsageError, add_fields, settings_fields
+from tightrope.language.settings import (
+    NOT_HERE,
+    RECIPES,
+    AlignSettings,
+    ModelSettings,
+    RewardSettings,
+    RLHFSettings,
+    SFTSettings,
+)
+
+PROGRAM = "tightrope"
+NEEDED = "The language story needs transformers. Install it with: pip install 'tightrope[language]'"
+
+
+def sft(words: list[str]) -> int:
+    """``tightrope sft``: supervised fine-tuning."""
+    given = _parser(
+        "sft", SFTSettings, "Fine-tune a causal language model on text, completions or chats."
+    ).read(words)
+    return _supervised("sft", SFTSettings, given)
+
+
+def reward(words: list[str]) -> int:
+    """``tightrope reward``: a reward model from preference pairs."""
+    given = _parser(
+        "reward", RewardSettings, "Train a reward model on pairs of a better and a worse text."
+    ).read(words)
+    return _supervised("reward", RewardSettings, given)
+
+
+def _supervised(name: str, kind: type, given: dict[str, Any]) -> int:
+    settings = _from_flags(kind, given)
+    if _dry_run(settings, given):
+        return 0
+    if not settings.data:
+        raise UsageError(f"What to learn from? Give --data FILE.jsonl: {PROGRAM} {name} --data FILE.jsonl")
+    _require_transformers()
+    from tightrope.language import display
+
+    columns, what = (display.SFT, "examples") if name == "sft" else (display.REWARD, "pairs")
+
+    def run(report: Any) -> dict[str, Any]:
+        if name == "sft":
+            from tightrope.language.sft import train_sft
+
+            return train_sft(settings, run_dir=given.get("run_dir"), report=report)
+        from tightrope.language.reward_model import train_reward
+
+        return train_reward(settings, run_dir=given.get("run_dir"), report=report)
+
+    return _watched(run, columns, what, given)
+
+
+def align(words: list[str]) -> int:
+    """``tightrope align``: PPO against any reward."""
+    given = _align_parser().read(words)
+    values = _values(given)
+    if (recipe := given.get("recipe")) is not None:
+        values = {**RECIPES[recipe].values, **values}
+    settings = AlignSettings().with_values(**values)
+    if _dry_run(settings, given):
+        return 0
+    for name, example in (("data", "--data PROMPTS.jsonl"), ("reward", "--reward length")):
+        if not getattr(settings, name):
+            raise UsageError(f"--{name} is missing. For example: {PROGRAM} align {example}")
+    _require_transformers()
+    from tightrope.language import display
+    from tightrope.language.align import align as run_align
+
+    def run(report: Any) -> dict[str, Any]:
+        return run_align(
+            settings, gold=given.get("gold"), run_dir=given.get("run_dir"), report=report
+        ).summary
+
+    return _watched(run, display.ALIGN, "responses", given)
+
+
+def resume(given: dict[str, Any]) -> int:
+    """``tightrope resume RUN`` of an alignment run."""
+    _require_transformers()
+    from tightrope.language import display
+    from tightrope.language.align import resume_align
+
+    def run(report: Any) -> dict[str, Any]:
+        more = {"prompts": given.get("data"), "reward": given.get("reward")}
+        return resume_align(
+            given["run"], total_episodes=given.get("total_steps"), report=report, **more
+        ).summary
+
+    return _watched(run, display.ALIGN, "responses", given)
+
+
+def sample(words: list[str]) -> int:
+    """``tightrope sample RUN``: responses of the aligned model beside the reference's."""
+    parser = Parser(
+        f"{PROGRAM} sample",
+        "%(prog)s RUN [options]",
+        "Responses of the aligned model beside the reference's.",
+    )
+    parser.add_argument("run", metavar="RUN", help="Run folder of align.")
+    group = parser.add_argument_group("sampling")
+    group.add_argument(
+        "--prompt", action="append", metavar="TEXT", help="A prompt of your own; may be repeated."
+    )
+    group.add_argument(
+        "--count", type=int, metavar="N", help="How many prompts of the run's data (default 8)."
+    )
+    group.add_argument("--seed", type=int, metavar="N", help="Seed of sampling (default: the run's + 1).")
+    _output(parser)
+    given = parser.read(words)
+    _require_transformers()
+    from tightrope.language.evaluate import sample_run
+
+    rows = sample_run(given["run"], **{k: given[k] for k in ("prompt", "count", "seed") if k in given})
+    if given.get("json"):
+        _print_json({"samples": rows})
+    else:
+        from tightrope.language.samples import print_comparison
+
+        print_comparison(rows)
+    return 0
+
+
+def doctor(words: list[str]) -> int:
+    """``tightrope doctor``: this machine, this installation, and with --model a language model's
+    self-check.
+    """
+    parser = Parser(
+        f"{PROGRAM} doctor", "%(prog)s [--model M]", "Check this installation; with --model a language model."
+    )
+    parser.add_argument(
+        "--model", metavar="M", help="Folder, hub id or packaged name of a causal language model."
+    )
+    _output(parser)
+    given = parser.read(words)
+    from tightrope.doctor import examine
+
+    findings = examine(given.get("model"))
+    if given.get("json"):
+        _print_json({"findings": [finding._asdict() for finding in findings]})
+    else:
+        for finding in findings:
+            print(f"{'ok  ' if finding.good else 'BAD '} {finding.what}: {finding.seen}")
+            if not finding.good:
+                print(f"     {finding.advice}")
+    return 0 if all(finding.good for finding in findings) else 1
+
+
+# ---------------------------------------------------------------------------- options
+
+
+def _parser(name: str, kind: type, description: str) -> Parser:
+    parser = Parser(f"{PROGRAM} {name}", "%(prog)s --model M --data FILE [options]", description)
+    shared = [field.name for field in dataclasses.fields(ModelSettings)]
+    own = [name for name in settings_fields(kind) if name not in shared]
+    add_fields(parser.add_argument_group("data and training"), kind, own)
+    add_fields(parser.add_argument_group("model and machine"), kind, shared)
+    _run_options(parser)
+    return parser
+
+
+def _align_parser() -> Parser:
+    parser = Parser(
+        f"{PROGRAM} align",
+        "%(prog)s --model M --data PROMPTS --reward R [options]",
+        "PPO on a causal language model against any reward.",
+        "Recipes: " + "; ".join(f"{name} ({recipe.source})" for name, recipe in RECIPES.items()),
+    )
+    fields = list(settings_fields(AlignSettings))
+    shared = [field.name for field in dataclasses.fields(ModelSettings)]
+    add_fields(
+        parser.add_argument_group("alignment"), AlignSettings, [name for name in fields if name not in shared]
+    )
+    inner = [name for name in settings_fields(RLHFSettings) if name not in NOT_HERE]
+    add_fields(parser.add_argument_group("update rule: ppo"), RLHFSettings, inner)
+    add_fields(parser.add_argument_group("model and machine"), AlignSettings, shared)
+    _run_options(parser)
+    group = parser.add_argument_group("recipes and judges")
+    group.add_argument(
+        "--recipe", choices=tuple(RECIPES), metavar="NAME", help=f"One of: {', '.join(RECIPES)}."
+    )
+    group.add_argument(
+        "--gold",
+        metavar="REWARD",
+        help="A second judge, for held-out prompts; never trained on (default: none).",
+    )
+    return parser
+
+
+def _run_options(parser: Parser) -> None:
+    group = parser.add_argument_group("run")
+    group.add_argument(
+        "--run-dir", metavar="FOLDER", help="Where the run lies (default runs/COMMAND-MODEL-TIME)."
+    )
+    group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
+    _output(parser)
+
+
+def _output(parser: Parser) -> None:
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "--json", action="store_true", help="Last line of stdout: one JSON object; the rest on stderr."
+    )
+    group.add_argument("--quiet", action="store_true", help="Print the end only.")
+
+
+NOT_SETTINGS = ("run_dir", "dry_run", "json", "quiet", "recipe", "gold")
+
+
+def _values(given: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in given.items() if name not in NOT_SETTINGS}
+
+
+def _from_flags(kind: type, given: dict[str, Any]) -> Any:
+    return kind(**_values(given))
+
+
+def _dry_run(settings: Any, given: dict[str, Any]) -> bool:
+    if given.get("dry_run"):
+        print(json.dumps(dataclasses.asdict(settings), indent=None if given.get("json") else 2))
+    return bool(given.get("dry_run"))
+
+
+def _require_transformers() -> None:
+    import importlib.util
+
+    if importlib.util.find_spec("transformers") is None:
+        raise UsageError(NEEDED)
+    from transformers.utils import logging
+
+    logging.disable_progress_bar()  # runs have a display of their own
+
+
+# ---------------------------------------------------------------------------- output
+
+
+def _watched(run: Callable[[Any], dict[str, Any]], columns: Any, what: str, given: dict[str, Any]) -> int:
+    """Run with the right display; print the end."""
+    from tightrope import panel
+    from tightrope.language.display import Display
+
+    as_json, quiet = bool(given.get("json")), bool(given.get("quiet"))
+    stream = sys.stderr if as_json else sys.stdout
+    live = not as_json and panel.can_live(sys.stdout, dict(os.environ))
+    display = Display(columns, what, stream, quiet=quiet, live=live)
+    try:
+        with display:
+            summary = run(display)
+    except KeyboardInterrupt:
+        where = f" Its last checkpoint lies in {display.run}." if display.run else ""
+        print(f"Stopped at {display.step:,} {what}.{where}", file=sys.stderr)
+        return 130
+    if as_json:
+        _print_json({**summary, "run_dir": display.run})
+        return 0
+    for name, value in (summary.get("final") or {}).items():
+        if isinstance(value, int | float) and not quiet:
+            print(f"{name:<32} {value:.4g}", file=stream)
+    print(f"run          {display.run}", file=stream)
+    if not quiet and display.run:
+        if what == "responses":
+            print(f"next         {shlex.join([PROGRAM, 'sample', display.run])}", file=stream)
+        model = Path(display.run) / "model"
+        print(f"model        {model}", file=stream)
+    return 0
+
+
+def _print_json(value: dict[str, Any]) -> None:
+    from tightrope.runs.records import dumps
+
+    print(dumps(value), flush=True)

@@ -1,0 +1,128 @@
+"""The third stage: PPO on a causal language model, as one function.
+
+from tightrope.language import align
+run = align(model="path/to/model", prompts=prompts, reward=reward, total_episodes=4096, seed=1)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tightrope.language.kl import bias_of
+from tightrope.language.saving import restore_state
+from tightrope.language.settings import NOT_HERE, AlignSettings
+from tightrope.language.trainer import Aligned, Reporter, Trainer
+from tightrope.runs.run import Run
+
+__all__ = ["Aligned", "align", "resume_align"]
+
+
+def _silent(event: str, data: dict[str, Any]) -> None:
+    """The reporter that says nothing."""
+
+
+def align(
+    settings: AlignSettings | None = None,
+    *,
+    prompts: Any = None,
+    reward: Any = None,
+    gold: Any = None,
+    run_dir: str | Path | None = None,
+    report: Reporter = _silent,
+    **values: Any,
+) -> Aligned:
+    """Train a language model against a reward; returns the run.
+
+    ``prompts``: texts, message lists or rows with a "prompt", or a file of them. ``reward``: a function as
+    TRL calls it, (function, weight), "length", FILE.py:function, the folder of a reward model, or a list of
+    these. ``gold``: another judge of the same kinds, asked on held-out prompts and never trained on.
+    Everything else is a field of AlignSettings or RLHFSettings. Raises ValueError for what cannot work,
+    before anything is trained.
+    """
+    settings = (settings or AlignSettings()).with_values(**_named(prompts, reward), **values)
+    for risk in settings.risks():
+        report("line", {"text": f"warning: {risk}", "warning": True})
+    if (bias := bias_of(settings.kl)) is not None:
+        report("line", {"text": f"warning: {bias}.", "warning": True})
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    trainer = Trainer(
+        settings,
+        settings.data if prompts is None else prompts,
+        settings.reward if reward is None else reward,
+        gold,
+        report,
+    )
+    run = Run.create(
+        run_dir, dataclasses.asdict(trainer.settings), f"align-{Path(settings.model).name}-{settings.seed}"
+    )
+    return trainer.run(run)
+
+
+def _named(prompts: Any, reward: Any) -> dict[str, str]:
+    """What settings.json says of objects that were given in Python: their names, for display."""
+    found = {}
+    for name, value in (("data", prompts), ("reward", reward)):
+        if value is not None:
+            found[name] = (
+                value if isinstance(value, str) else getattr(value, "__name__", f"<{type(value).__name__}>")
+            )
+    return found
+
+
+def resume_align(
+    run_dir: str | Path,
+    *,
+    prompts: Any = None,
+    reward: Any = None,
+    gold: Any = None,
+    total_episodes: int | None = None,
+    report: Reporter = _silent,
+) -> Aligned:
+    """Go on from a run's newest checkpoint: adapters, critic, optimiser, kl_beta, prompt order, random
+    numbers.
+
+    Code is never named by a file: a reward that was a function must be given again, and prompts that were no
+    file too. ``total_episodes`` extends a finished run.
+    """
+    run = Run.open(run_dir)
+    settings = settings_from_json(run.settings)
+    if total_episodes is not None:
+        settings = settings.with_values(total_episodes=total_episodes)
+    if reward is None and settings.reward != "length" and not Path(settings.reward).is_dir():
+        raise ValueError(
+            f"{run_dir} was trained against {settings.reward!r}, which no file may import. Name it again: "
+            f"tightrope resume {run_dir} --reward FILE.py:function"
+        )
+    if prompts is None and not Path(settings.data).is_file():
+        raise ValueError(
+            f"The prompts of {run_dir} were {settings.data!r}, which is no file. Give them again: "
+            f"tightrope resume {run_dir} --data PROMPTS.jsonl"
+        )
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    sources = (
+        settings.data if prompts is None else prompts,
+        settings.reward if reward is None else reward,
+        gold,
+    )
+    trainer = Trainer(settings, *sources, report)
+    restore_state(trainer, run.newest_checkpoint())
+    run.rewind(trainer.episodes)
+    run.update_settings(dataclasses.asdict(settings))
+    return trainer.run(run)
+
+
+def settings_from_json(data: dict[str, Any]) -> AlignSettings:
+    """The settings of an alignment run's settings.json. ValueError for another command's, or unknown
+    names.
+    """
+    if "update" not in data or "max_new_tokens" not in data:
+        raise ValueError("These are not the settings of an alignment run.")
+    return AlignSettings().with_values(**{k: v for k, v in data.items() if k != "update"}, **{
+        name: value for name, value in data["update"].items() if name not in NOT_HERE
+    })  # fmt: skip

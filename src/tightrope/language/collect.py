@@ -1,0 +1,261 @@
+"""One iteration's experience: prompts -> responses -> scores -> rewards per token -> advantages -> Batch."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tightrope.algorithms.batch import Batch
+from tightrope.language.data import Prompt, pad_left
+from tightrope.language.kl import kl_rewards
+from tightrope.language.rewards import Scores
+from tightrope.language.roles import Roles
+from tightrope.language.sampling import Responses, sample
+from tightrope.language.settings import AlignSettings
+from tightrope.language.token_stats import token_statistics
+from tightrope.maths import divergence, returns
+from tightrope.maths.statistics import masked_mean, masked_sum, masked_variance
+
+
+class Scorer(Protocol):
+    """Anything that scores whole responses; see `scoring.Judge`."""
+
+    def __call__(self, prompts: Sequence[Prompt], experience: Experience) -> Scores: ...
+
+
+@dataclass
+class Experience:
+    """Responses and what the roles say of them. ``tokens``, ``real``: prompt and response, [B, P + R].
+
+    ``logp``, ``ref_logp``, ``entropy``, ``exact`` (KL of the state), ``values``: [B, R]. ``final_values``
+    [B]: V of the state after the last token. ``lower`` and ``ref_hidden`` are kept for the epochs that
+    follow.
+    """
+
+    tokens: Tensor
+    real: Tensor
+    responses: Responses
+    logp: Tensor
+    ref_logp: Tensor
+    entropy: Tensor
+    exact: Tensor
+    values: Tensor
+    final_values: Tensor
+    lower: Tensor | None
+    ref_hidden: Tensor | None
+    seconds: float
+
+    @property
+    def last(self) -> Tensor:
+        """[B]: the column of each response's last real token."""
+        return self.responses.mask.sum(1) - 1
+
+    def ids(self) -> list[list[int]]:
+        """The token ids of each response, padding left out."""
+        pairs = zip(self.responses.tokens, self.responses.mask, strict=True)
+        return [tokens[mask].tolist() for tokens, mask in pairs]
+
+
+class PromptOrder:
+    """Prompts in a fresh random order for every pass over them: a function of seed and position alone."""
+
+    def __init__(self, count: int, seed: int) -> None:
+        self.count, self.seed, self.position = count, seed, 0
+
+    def take(self, number: int) -> list[int]:
+        """The indices of the next prompts; ``position`` says how many were taken so far."""
+        taken = []
+        for place in range(self.position, self.position + number):
+            order = np.random.default_rng([self.seed, 7, place // self.count]).permutation(self.count)
+            taken.append(int(order[place % self.count]))
+        self.position += number
+        return taken
+
+
+def gather(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Experience:
+    """``samples`` responses to each prompt, and what policy, reference and critic say of them. No
+    gradients.
+    """
+    settings = roles.settings
+    begin = time.perf_counter()
+    device = next(roles.model.parameters()).device
+    tokens, real = (x.to(device) for x in pad_left([prompt.tokens for prompt in prompts]))
+    rows = len(prompts) * samples
+    numbers = np.random.default_rng([seed, 8, iteration]).random((rows, settings.max_new_tokens))
+    with roles.frozen_policy():
+        uniforms = torch.from_numpy(numbers).to(device)
+        responses = sample(
+            roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples
+        )
+        seconds = time.perf_counter() - begin
+        tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
+        real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
+        size = settings.update.micro_batch_size or rows
+        pieces = [_look(roles, tokens, real, responses, slice(k, k + size)) for k in range(0, rows, size)]
+    joined = {name: _joined([piece[name] for piece in pieces]) for name in pieces[0]}
+    return Experience(tokens=tokens, real=real, responses=responses, seconds=seconds, **joined)
+
+
+def _joined(parts: list[Any]) -> Any:
+    return None if parts[0] is None else torch.cat(parts)
+
+
+@torch.no_grad()
+def _look(roles: Roles, tokens: Tensor, real: Tensor, responses: Responses, rows: slice) -> dict[str, Any]:
+    """What the roles say of some rows."""
+    tokens, real, mask = tokens[rows], real[rows], responses.mask[rows]
+    first = tokens.shape[1] - mask.shape[1] - 1
+    lower = roles.trunk.lower(tokens, real)
+    policy = roles.policy_hidden(tokens, real, lower)
+    reference = roles.reference_hidden(tokens, real, lower)[:, first:-1]
+    support = None if responses.support is None else responses.support[rows][mask]
+    chosen, head = responses.tokens[rows][mask], roles.head_of_reference()
+    more: dict[str, Any] = {"support": support, "reference": reference[mask], "reference_head": head}
+    own = token_statistics(policy[:, first:-1][mask], roles.trunk.parts.head, chosen, roles.sampling, **more)
+    theirs = token_statistics(reference[mask], head, chosen, roles.sampling, support=support)
+    zeros = torch.zeros(mask.shape, device=tokens.device)
+    values, final = zeros, zeros[:, 0]
+    if roles.critic_head is not None:
+        hidden = roles.critic_hidden(policy, tokens, real, lower)[:, first:]
+        every = roles.critic_head(hidden.float())[:, :, 0]
+        values = torch.where(mask, every[:, :-1], 0.0)
+        final = every.gather(1, mask.sum(1, keepdim=True))[:, 0]
+    found = {
+        name: zeros.masked_scatter(mask, x)
+        for name, x in (
+            ("logp", own.logp),
+            ("entropy", own.entropy),
+            ("exact", own.kl),
+            ("ref_logp", theirs.logp),
+        )
+    }
+    exact_loss = roles.settings.kl in ("exact-split", "exact-loss")
+    kept = torch.where(mask[..., None], reference, 0.0) if exact_loss else None
+    return {**found, "values": values, "final_values": final, "lower": lower, "ref_hidden": kept}
+
+
+def rewards_of(
+    experience: Experience, scores: Scores, settings: AlignSettings, kl_beta: float
+) -> tuple[Tensor, float]:
+    """Rewards per token [B, R]: what the KL costs, and the score on the last real token.
+
+    With them what they were multiplied by: 1, or with ``whiten_rewards`` one over their deviation.
+    """
+    mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
+    total = torch.from_numpy(np.nan_to_num(scores.total)).to(experience.logp) * settings.reward_scale
+    if settings.reward_clip is not None:
+        total = total.clamp(-settings.reward_clip, settings.reward_clip)
+    if settings.missing_eos_penalty is not None:
+        total = torch.where(experience.responses.ended, total, total - settings.missing_eos_penalty)
+    # the two log-probabilities of the KL come from one kind of pass: in bfloat16 sampling rounds otherwise
+    logp = experience.responses.logp if settings.dtype == "float32" else experience.logp
+    steps = (experience.ref_logp, experience.exact, mask, settings.update.gamma)
+    found = kl_rewards(settings.kl, kl_beta, logp, *steps)
+    found[rows, experience.last] += total
+    if not settings.whiten_rewards:
+        return found, 1.0
+    counting = mask & torch.from_numpy(scores.valid).to(mask.device)[:, None]
+    scale = 1.0 / (float(masked_variance(found, counting).sqrt()) + 1e-8) if bool(counting.any()) else 1.0
+    return torch.where(mask, found * scale, 0.0), scale
+
+
+def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: AlignSettings) -> Batch:
+    """Advantages and returns of the responses whose score counts (``valid`` [B]), as ppo.update takes
+    them.
+    """
+    mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
+    ended = torch.zeros_like(mask)
+    ended[rows, experience.last] = True
+    terminated = ended.clone()
+    if settings.truncation == "bootstrap":
+        terminated[rows, experience.last] = experience.responses.ended
+    update, values = settings.update, experience.values
+    if settings.critic == "none":
+        advantages = leave_one_out(rewards, mask, valid, settings.samples_per_prompt)
+        targets = torch.zeros_like(rewards)
+    else:
+        following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], 1)
+        following = torch.where(ended, experience.final_values[:, None], following)
+        policy_lambda: Any = update.gae_lambda
+        if settings.lambda_alpha is not None:
+            policy_lambda = length_lambda(mask.sum(1), settings.lambda_alpha)
+        critic_lambda = update.gae_lambda if settings.critic_lambda is None else settings.critic_lambda
+        steps = (rewards, values, following, terminated, ended, update.gamma)
+        advantages = returns.gae(*steps, policy_lambda, mask)
+        targets = returns.gae(*steps, critic_lambda, mask) + values
+    old = experience.responses.logp if settings.dtype == "float32" else experience.logp
+    inputs = {"tokens": experience.tokens, "real": experience.real, "ref_logp": experience.ref_logp}
+    optional = {
+        "lower": experience.lower, "ref_hidden": experience.ref_hidden,
+        "support": experience.responses.support,
+    }  # fmt: skip
+    inputs |= {name: x for name, x in optional.items() if x is not None}
+    batch = Batch(inputs, experience.responses.tokens, old, values, advantages, targets, mask)
+    return batch.select(valid.nonzero()[:, 0])
+
+
+def length_lambda(lengths: Tensor, alpha: float) -> Tensor:
+    """VAPO's length-adaptive lambda [B]: max(0, 1 - 1 / (alpha l)) of a response of l tokens."""
+    return (1.0 - 1.0 / (alpha * lengths.float())).clamp(min=0.0)
+
+
+def leave_one_out(rewards: Tensor, mask: Tensor, valid: Tensor, samples: int) -> Tensor:
+    """Advantages without a critic: reward to go minus the mean return of the prompt's *other* responses.
+
+    The baseline does not depend on the response it is subtracted from, so it adds no bias (Kool et al. 2019).
+    Rows of one prompt are neighbours; a response whose score does not count is nobody's baseline.
+    """
+    ended = torch.zeros_like(mask)
+    to_go = returns.discounted_returns(rewards, ended, 1.0, mask=mask)
+    total = torch.where(valid, torch.where(mask, rewards, 0.0).sum(1), 0.0).view(-1, samples)
+    count = valid.view(-1, samples).to(total)
+    others = (total.sum(1, keepdim=True) - total) / (count.sum(1, keepdim=True) - count).clamp(min=1)
+    return torch.where(mask, to_go - others.view(-1, 1), 0.0)
+
+
+def describe(experience: Experience, scores: Scores, rewards: Tensor, valid: Tensor) -> dict[str, float]:
+    """The metrics of a rollout: sums over a response, and token means under names that say so."""
+    mask = experience.responses.mask & valid[:, None]
+    count = max(1, int(valid.sum()))
+    log_ratio = torch.where(mask, experience.ref_logp - experience.logp, 0.0)
+
+    def per_response(x: Tensor) -> float:
+        return float(masked_sum(x, mask)) / count
+
+    total = scores.total[scores.valid]
+    kl, lengths = per_response(divergence.k1(log_ratio)), mask.sum(1)[valid].float()
+    score = float(np.mean(total)) if len(total) else float("nan")
+    gap = (experience.responses.logp - experience.logp)[mask].abs()
+    return {
+        "objective/kl": kl,
+        "objective/kl_k2": per_response(divergence.k2(log_ratio)),
+        "objective/kl_k3": per_response(divergence.k3(log_ratio)),
+        "objective/kl_exact": per_response(experience.exact),
+        "objective/kl_token_mean": float(masked_mean(divergence.k1(log_ratio), mask)),
+        "objective/scores": score,
+        "objective/scores_std": float(np.std(total)) if len(total) else float("nan"),
+        "objective/rlhf_reward": per_response(rewards),
+        "objective/non_score_reward": per_response(rewards) - score,
+        "objective/entropy": per_response(-experience.logp),
+        "objective/entropy_token_mean": float(masked_mean(experience.entropy, mask)),
+        "objective/response_length": float(lengths.mean()) if len(lengths) else 0.0,
+        "objective/eos_fraction": float(experience.responses.ended[valid].float().mean()) if count else 0.0,
+        "objective/truncated_fraction": float((~experience.responses.ended[valid]).float().mean()),
+        "objective/masked_samples": float((~valid).sum()),
+        "objective/distinct_2": distinct(experience.ids()),
+        "objective/sampling_gap": float(gap.max()) if gap.numel() else 0.0,
+        "time/generate_seconds": experience.seconds,
+        "time/tokens_per_second": float(experience.responses.mask.sum()) / max(experience.seconds, 1e-9),
+    }
+
+
+def distinct(rows: list[list[int]], n: int = 2) -> float:
+    """Distinct n-grams / all n-grams over a batch: falls towards 0 when responses repeat themselves."""
+    grams = [tuple(row[k : k + n]) for row in rows for k in range(len(row) - n + 1)]
+    return len(set(grams)) / len(grams) if grams else 1.0

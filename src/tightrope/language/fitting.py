@@ -1,0 +1,268 @@
+"""The loop that supervised fine-tuning and reward modelling share, and what stands before it: model, data.
+
+minibatch -> micro-batches, whose gradients add up -> Adam -> record; held-out examples after every epoch
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tightrope.algorithms.optimise import Adam, Brake, Meter
+from tightrope.algorithms.settings import scheduled
+from tightrope.language import lora
+from tightrope.language.data import Row, read_rows
+from tightrope.language.models import (
+    context_length,
+    eos_ids,
+    find_model,
+    load_causal,
+    load_tokenizer,
+    without_dropout,
+)
+from tightrope.language.settings import SupervisedSettings
+from tightrope.runs.run import Run
+
+Item = TypeVar("Item")
+Reporter = Callable[[str, dict[str, Any]], None]
+
+
+def silent(event: str, data: dict[str, Any]) -> None:
+    """The reporter that says nothing."""
+
+
+def warner(report: Reporter) -> Callable[[str], None]:
+    """Reports a text as a warning."""
+    return lambda text: report("line", {"text": f"warning: {text}", "warning": True})
+
+
+class Loaded(NamedTuple):
+    """A causal language model that is ready to train: its tokenizer, the folder or id it came from, the ids
+    that end a response (the first closes texts), and the adapter that is trained (None: every weight).
+    """
+
+    model: Any
+    tokenizer: Any
+    source: str
+    eos: tuple[int, ...]
+    adapter: str | None
+
+
+def load(settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None = None) -> Loaded:
+    """Load the settings' model, or take a (model, tokenizer) that is given and train it in place.
+
+    Tuned in full, the weights stay float32 whatever ``dtype`` says: a step of 1e-5 is lost on a bfloat16
+    weight; `precision` then lowers the arithmetic alone. ValueError when max_tokens exceeds the context.
+    """
+    if given is not None:
+        source = given[0].name_or_path or settings.model
+    else:
+        source = find_model(settings.model)
+        dtype = torch.float32 if settings.tune == "full" else getattr(torch, settings.dtype)
+        given = load_causal(source, dtype), load_tokenizer(source)
+    model, tokenizer = given
+    limit = context_length(model)
+    if limit is not None and settings.max_tokens > limit:
+        raise ValueError(
+            f"max_tokens is {settings.max_tokens}, but {settings.model} reads {limit} tokens. Choose "
+            f"max_tokens {limit} or less."
+        )
+    without_dropout(model.to(settings.device))
+    eos = sorted(eos_ids(model, tokenizer), key=lambda token: token != tokenizer.eos_token_id)
+    if settings.gradient_checkpointing:
+        lora.checkpoint_activations(model)
+        model.train()  # transformers checkpoints in training mode alone; dropout is 0 everywhere
+    if settings.tune == "full":
+        return Loaded(model.requires_grad_(True), tokenizer, source, tuple(eos), None)
+    layers = lora.top_layers(model, settings.lora_layers)
+    lora.add_adapter(model, adapter, settings.lora_rank, settings.lora_alpha, layers, settings.seed)
+    return Loaded(model, tokenizer, source, tuple(eos), adapter)
+
+
+@contextlib.contextmanager
+def precision(settings: SupervisedSettings) -> Iterator[None]:
+    """The arithmetic of one forward pass: bfloat16 over float32 weights where all of them are trained.
+
+    Never around a step of the optimiser: inside, torch keeps the lowered weights it has made.
+    """
+    lowered = settings.tune == "full" and settings.dtype == "bfloat16"
+    with torch.autocast(torch.device(settings.device).type, torch.bfloat16, enabled=lowered):
+        yield
+
+
+@contextlib.contextmanager
+def threads(count: int | None) -> Iterator[None]:
+    """Torch uses ``count`` CPU threads inside (None: as many as now)."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def training_rows(settings: SupervisedSettings, data: Any) -> list[Row]:
+    """The rows of ``data``, or of the file that the settings name. ValueError when there is neither."""
+    source = settings.data if data is None else data
+    if isinstance(source, str) and not source:
+        raise ValueError("There is no data. Give --data FILE, or data= in Python.")
+    return read_rows(source, settings.max_examples)
+
+
+def hold_out(
+    items: Sequence[Item], share: float, seed: int, group: Callable[[Item], Hashable] | None = None
+) -> tuple[list[Item], list[Item]]:
+    """Items to train on and items held out, about ``share`` of them, drawn by the seed; in their order.
+
+    Items of one ``group`` stay together, unless a group is larger than the share. At least one item is held
+    out where there are two or more and the share is above 0.
+    """
+    left = max(1, round(share * len(items))) if share > 0 and len(items) > 1 else 0
+    keys: list[Hashable] = list(range(len(items)))
+    if group is not None:
+        groups: list[Hashable] = [group(item) for item in items]
+        keys = groups if max(Counter(groups).values(), default=0) <= left else keys
+    sizes = Counter(keys)
+    names = list(sizes)
+    held: set[Hashable] = set()
+    for index in np.random.default_rng([seed, 1]).permutation(len(names)):
+        if left <= 0:
+            break
+        held.add(names[index])
+        left -= sizes[names[index]]
+    parts: tuple[list[Item], list[Item]] = ([], [])
+    for item, key in zip(items, keys, strict=True):
+        parts[key in held].append(item)
+    return parts
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What is learnt from ``items``.
+
+    ``loss(items)`` is the loss summed over their terms, and sums of further figures by name; ``count(item)``
+    its number of terms, ``length(item)`` its tokens. Metrics are named ``name/...``, those of the optimiser
+    ``steps/...``; ``seen`` names a metric of all terms so far. ``evaluate()`` looks at held-out items.
+    """
+
+    name: str
+    steps: str
+    items: Sequence[Any]
+    loss: Callable[[Sequence[Any]], tuple[Tensor, dict[str, Tensor]]]
+    count: Callable[[Any], int]
+    length: Callable[[Any], int]
+    evaluate: Callable[[], dict[str, float]]
+    seen: str | None = None
+
+
+def fit(
+    objective: Objective,
+    parameters: Sequence[nn.Parameter],
+    settings: SupervisedSettings,
+    run: Run,
+    report: Reporter,
+) -> dict[str, float]:
+    """Train; returns the newest value of every metric. A step is one minibatch.
+
+    Raises NonFiniteError before a step with a NaN or an infinity in its gradient.
+    """
+    group = {"params": list(parameters), "lr": settings.learning_rate}
+    optimiser = Adam([group], eps=1e-8, fused=True)
+    brake, rng = Brake(parameters[0].device), np.random.default_rng(settings.seed)
+    items, size = objective.items, settings.minibatch_size
+    each = math.ceil(len(items) / size)
+    total, seconds, seen = each * settings.num_epochs, 0.0, 0
+    newest = objective.evaluate()
+    if newest:
+        run.record(0, 0.0, newest)
+    for step in range(total):
+        if step % each == 0:
+            order = rng.permutation(len(items))
+        clock = time.perf_counter()
+        minibatch = [items[i] for i in order[step % each * size :][:size]]
+        rate = scheduled(settings.learning_rate, settings.learning_rate_schedule, step / total)
+        optimiser.param_groups[0]["lr"] = rate
+        metrics = take_step(objective, minibatch, optimiser, brake, settings)
+        metrics[f"{objective.steps}/learning_rate"] = rate or 0.0
+        seen += sum(objective.count(item) for item in minibatch)
+        if objective.seen is not None:
+            metrics[objective.seen] = float(seen)
+        seconds += time.perf_counter() - clock
+        if (step + 1) % each == 0:
+            metrics |= objective.evaluate()
+        metrics["time/seconds"] = seconds
+        run.record(step + 1, seconds, metrics)
+        report("update", {"step": step + 1, "total_steps": total, "metrics": metrics, "seconds": seconds})
+        newest |= metrics
+    return newest
+
+
+def take_step(
+    objective: Objective,
+    minibatch: Sequence[Any],
+    optimiser: torch.optim.Optimizer,
+    brake: Brake,
+    settings: SupervisedSettings,
+) -> dict[str, float]:
+    """One optimiser step on the mean over all terms of the minibatch, however it is split."""
+    meter, sums = Meter(), dict[str, Tensor]()
+    count = sum(objective.count(item) for item in minibatch)
+    optimiser.zero_grad(set_to_none=True)
+    for part in micro_batches(minibatch, settings.micro_batch_size, objective.length):
+        loss, figures = objective.loss(part)
+        (loss / count).backward()
+        for name, x in {"loss": loss.detach(), **figures}.items():
+            sums[name] = sums[name] + x if name in sums else x
+    brake.step(optimiser, settings.max_grad_norm, meter)
+    brake.halted(poll=True)
+    metrics = {f"{objective.name}/{name}": float(x) / count for name, x in sums.items()}
+    metrics[f"{objective.steps}/grad_norm"] = meter.means()["train/grad_norm"]
+    return metrics
+
+
+def micro_batches(
+    items: Sequence[Item], size: int | None, length: Callable[[Item], int]
+) -> Iterator[list[Item]]:
+    """The items, sorted by length so that little is padded, ``size`` at a time (None: all at once)."""
+    ordered = sorted(items, key=length)
+    for start in range(0, len(ordered), size or max(1, len(ordered))):
+        yield ordered[start : start + (size or len(ordered))]
+
+
+def announcement(
+    settings: SupervisedSettings, run: Run, loaded: Loaded, parameters: Sequence[nn.Parameter], data: str
+) -> dict[str, Any]:
+    """What is reported when training starts: the settings, the run folder, and two lines in words."""
+    trained = sum(parameter.numel() for parameter in parameters)
+    total = sum(parameter.numel() for parameter in loaded.model.parameters())
+    lines = [
+        f"model: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained",
+        f"data: {data}",
+    ]
+    return {"settings": run.settings, "run_dir": str(run.path), "lines": lines, "step": 0}
+
+
+def finish(
+    settings: SupervisedSettings, run: Run, report: Reporter, final: dict[str, float], **more: Any
+) -> dict[str, Any]:
+    """Write summary.json and report it; returns it."""
+    summary = {
+        "model": settings.model,
+        "seed": settings.seed,
+        **more,
+        "wall_seconds": final.get("time/seconds", 0.0),
+        "final": {name: value for name, value in final.items() if name != "time/seconds"},
+        "run_dir": str(run.path),
+    }
+    run.finish(summary)
+    report("finish", summary)
+    return summary

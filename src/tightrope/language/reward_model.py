@@ -1,0 +1,280 @@
+"""The second stage: a reward model from preferences, and its scores.
+
+    L = -log sigmoid(r(chosen) - r(rejected)),  r(text) = w . h(last real token)      (Bradley, Terry 1952)
+
+A trained score is put to mean 0 and deviation 1 on demonstrations: r = w' . h - shift. w' = w / deviation is
+saved as the head, and shift = mean / deviation stands in config.json: the head has no bias to hold it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tightrope.language import lora
+from tightrope.language.data import Pair, pad_right, preference_pairs, read_rows, sft_examples
+from tightrope.language.fitting import (
+    Loaded,
+    Objective,
+    Reporter,
+    announcement,
+    finish,
+    fit,
+    hold_out,
+    load,
+    micro_batches,
+    precision,
+    silent,
+    threads,
+    training_rows,
+    warner,
+)
+from tightrope.language.models import load_tokenizer, parts, without_dropout
+from tightrope.language.reward_saving import SHIFT, reward_skeleton, save_reward
+from tightrope.language.sampling import positions
+from tightrope.language.settings import RewardSettings
+from tightrope.runs.run import Run
+
+DEMONSTRATIONS = 1024  # texts on which scores are normalised, at most
+BINS = 10
+
+
+def last_real(hidden: Tensor, real: Tensor) -> Tensor:
+    """The hidden state [B, d] of each row's last real token: by the mask, never by a padding id."""
+    places = torch.arange(real.shape[1], device=real.device)
+    last = torch.where(real, places, 0).argmax(1)
+    return hidden[torch.arange(len(hidden), device=hidden.device), last]
+
+
+class RewardModel:
+    """Scores of whole texts. ``base`` gives hidden states, ``head`` [1, d] their score, less ``shift``."""
+
+    def __init__(self, base: nn.Module, head: nn.Linear, shift: float, tokenizer: Any = None) -> None:
+        self.base, self.head, self.shift, self.tokenizer = base, head, shift, tokenizer
+
+    def to(self, device: torch.device | str) -> RewardModel:
+        """Move it, and return it."""
+        self.base.to(device)
+        self.head.to(device)
+        return self
+
+    def raw(self, tokens: Tensor, real: Tensor, *, right: bool = False) -> Tensor:
+        """Scores [B] before the shift, differentiable. ``right``: all padding stands behind the text, where
+        causal attention never looks, and no mask is needed.
+        """
+        mask: dict[str, Tensor] = {}
+        if not right and not bool(real.all()):
+            mask = {"attention_mask": real.long(), "position_ids": positions(real)}
+        hidden = self.base(input_ids=tokens, use_cache=False, **mask).last_hidden_state
+        with torch.autocast(hidden.device.type, enabled=False):
+            return self.head(last_real(hidden, real).to(self.head.weight.dtype))[:, 0]
+
+    @torch.no_grad()
+    def score(self, tokens: Tensor, real: Tensor) -> Tensor:
+        """Scores [B] of texts [B, T] padded anywhere, with any id; ``real`` is True for their tokens."""
+        return self.raw(tokens, real) - self.shift
+
+
+def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> RewardModel:
+    """A reward model from a run folder of ``tightrope reward``, or from any folder that
+    AutoModelForSequenceClassification loads with one label and a head called ``score``.
+
+    ValueError when there is none, or when the folder holds another kind of model.
+    """
+    from transformers import AutoModelForSequenceClassification
+
+    path = Path(folder)
+    path = path / "model" if (path / "model" / "config.json").is_file() else path
+    if not (path / "config.json").is_file():
+        raise ValueError(
+            f"{folder} is no reward model: it holds no config.json. Train one: tightrope reward."
+        )
+    kinds = json.loads((path / "config.json").read_text(encoding="utf-8")).get("architectures") or [
+        "nothing named"
+    ]
+    if not kinds[0].endswith("ForSequenceClassification"):  # loading would make up a head
+        raise ValueError(
+            f"{folder} holds {kinds[0]}, which gives no scores. Train a reward model: tightrope reward."
+        )
+    model = AutoModelForSequenceClassification.from_pretrained(path, dtype=dtype, attn_implementation="sdpa")
+    head = getattr(model, "score", None)
+    if model.config.num_labels != 1 or not isinstance(head, nn.Linear):
+        raise ValueError(
+            f"{folder} is {kinds[0]} with {model.config.num_labels} labels; expected one label and a linear "
+            "head called score. Wrap it in a reward function."
+        )
+    without_dropout(model)
+    base = getattr(model.eval(), model.base_model_prefix)
+    return RewardModel(base, head, float(getattr(model.config, SHIFT, 0.0)), load_tokenizer(str(path)))
+
+
+def make_head(width: int, seed: int) -> nn.Linear:
+    """A head [1, d] from N(0, 1 / sqrt(d + 1)), the deviation; without bias (Stiennon et al. 2020)."""
+    head = nn.utils.skip_init(nn.Linear, width, 1, bias=False)
+    noise = torch.randn(1, width, generator=torch.Generator().manual_seed(seed))
+    with torch.no_grad():
+        head.weight.copy_(noise / math.sqrt(width + 1))
+    return head
+
+
+def pair_loss(difference: Tensor) -> Tensor:
+    """-log sigmoid(r(chosen) - r(rejected)), summed over pairs [B]; nats."""
+    return -nn.functional.logsigmoid(difference).sum()
+
+
+def right_order(difference: Tensor) -> Tensor:
+    """1 where the chosen one scores higher, 0 where it does not, 1/2 where both score the same; [B]."""
+    return (difference.sign() + 1) / 2
+
+
+def calibration(difference: Tensor) -> tuple[float, list[dict[str, float]]]:
+    """The expected calibration error of sigmoid(|difference|), [N], and the table it comes from.
+
+    A pair's confidence is that of the order the model prefers, 0.5 to 1. By BINS equal bins of confidence:
+    pairs, mean confidence, accuracy; the error is the mean gap between the last two, weighted by pairs.
+    """
+    confidence = torch.sigmoid(difference.double().abs())
+    right = right_order(difference.double())
+    index = ((confidence - 0.5) * 2 * BINS).long().clamp(max=BINS - 1)
+    table, error = [], 0.0
+    for i in range(BINS):
+        inside = index == i
+        count = int(inside.sum())
+        if count:
+            mean, accuracy = float(confidence[inside].mean()), float(right[inside].mean())
+            error += count / len(difference) * abs(accuracy - mean)
+            begin, end = 0.5 + i / (2 * BINS), 0.5 + (i + 1) / (2 * BINS)
+            table.append({"from": begin, "to": end, "pairs": count, "confidence": mean, "accuracy": accuracy})
+    return error, table
+
+
+def differences(model: RewardModel, pairs: Sequence[Pair]) -> Tensor:
+    """r(chosen) - r(rejected) of pairs [B], differentiable; both texts of a pair in one forward pass."""
+    texts = [pair.chosen for pair in pairs] + [pair.rejected for pair in pairs]
+    tokens, real = (x.to(model.head.weight.device) for x in pad_right(texts))
+    chosen, rejected = model.raw(tokens, real, right=True).chunk(2)
+    return chosen - rejected
+
+
+def longest(pair: Pair) -> int:
+    """The tokens of the longer text of a pair."""
+    return max(len(pair.chosen), len(pair.rejected))
+
+
+@torch.no_grad()
+def normalise(model: RewardModel, texts: Sequence[Sequence[int]], size: int) -> tuple[float, float]:
+    """Put the scores to mean 0 and deviation 1 on these texts; returns what mean and deviation were.
+
+    Scores that are all the same keep their scale.
+    """
+    parts_of = micro_batches(texts, size, len)
+    batches = [tuple(x.to(model.head.weight.device) for x in pad_right(part)) for part in parts_of]
+    scores = torch.cat([model.raw(tokens, real, right=True) for tokens, real in batches]).double()
+    mean, deviation = float(scores.mean()), float(scores.std(correction=0))
+    gain = 1 / deviation if deviation > 1e-6 else 1.0
+    model.head.weight.mul_(gain)
+    model.shift = mean * gain
+    return mean, deviation
+
+
+def train_reward(
+    settings: RewardSettings,
+    *,
+    data: Any = None,
+    validation: Any = None,
+    demonstrations: Any = None,
+    model: tuple[Any, Any] | None = None,
+    report: Reporter = silent,
+    run_dir: str | Path | None = None,
+) -> dict[str, Any]:
+    """Train a reward model; returns the summary that is also written to the run folder.
+
+    ``data`` and ``validation`` replace the files that the settings name: rows in any format of
+    `preference_pairs`; ``demonstrations``: rows of `sft_examples`. ``model``: a causal (model, tokenizer),
+    whose trunk is trained in place. The run folder holds settings.json, metrics.jsonl, summary.json (with the
+    calibration table) and ``model``, which AutoModelForSequenceClassification.from_pretrained loads; tuned by
+    LoRA also ``adapter``, which PEFT loads and alignment puts on its own trunk.
+    Raises ValueError for data or settings that cannot work, before anything is trained.
+    """
+    with threads(settings.threads):
+        loaded = load(settings, "reward", model)
+        with lora.using(loaded.model, loaded.adapter):
+            return _train(settings, loaded, (data, validation, demonstrations), report, run_dir)
+
+
+def _train(
+    settings: RewardSettings, loaded: Loaded, sources: tuple[Any, Any, Any], report: Reporter, run_dir: Any
+) -> dict[str, Any]:
+    base, size = parts(loaded.model).base, settings.micro_batch_size or settings.minibatch_size
+    head = make_head(loaded.model.config.hidden_size, settings.seed).to(settings.device)
+    model, skeleton = RewardModel(base, head, 0.0, loaded.tokenizer), reward_skeleton(loaded)
+    pairs, held, texts = _data(settings, loaded, *sources, report)
+
+    def loss(items: Sequence[Pair]) -> tuple[Tensor, dict[str, Tensor]]:
+        with precision(settings):
+            found = differences(model, items)
+        seen = found.detach()
+        return pair_loss(found), {"accuracy": right_order(seen).sum(), "margin": seen.sum()}
+
+    @torch.no_grad()
+    def held_out() -> Tensor:
+        with precision(settings):
+            return torch.cat([differences(model, part) for part in micro_batches(held, size, longest)])
+
+    def evaluate() -> dict[str, float]:
+        if not held:
+            return {}
+        found = held_out()
+        accuracy = float(right_order(found).mean())
+        return {"reward/held_out_accuracy": accuracy, "reward/calibration_error": calibration(found)[0]}
+
+    own = list(base.parameters())
+    if loaded.adapter is not None:
+        own = lora.adapter_parameters(loaded.model, loaded.adapter)
+    parameters = [*own, *head.parameters()]
+    objective = Objective("reward", "train", pairs, loss, lambda pair: 1, longest, evaluate)
+    name = f"reward-{Path(settings.model).name}-{settings.seed}"
+    with Run.create(run_dir, dataclasses.asdict(settings), name) as run:
+        words = f"{len(pairs)} pairs; {len(held)} held out"
+        report("start", announcement(settings, run, loaded, parameters, words))
+        final = fit(objective, parameters, settings, run, report)
+        table = calibration(held_out())[1] if held else []
+        with precision(settings):
+            mean, deviation = normalise(model, texts, size)
+        save_reward(skeleton, loaded, head.weight, model.shift, run.path, final)
+        numbers = {"pairs": len(pairs), "held_out_pairs": len(held), "calibration": table}
+        scale = {"score_mean": mean, "score_deviation": deviation, "demonstrations": len(texts)}
+        return finish(settings, run, report, final, **numbers, **scale)
+
+
+def _data(
+    settings: RewardSettings,
+    loaded: Loaded,
+    data: Any,
+    validation: Any,
+    demonstrations: Any,
+    report: Reporter,
+) -> tuple[list[Pair], list[Pair], list[tuple[int, ...]]]:
+    """Pairs to train on, pairs held out (whole prompts, where there are many), and texts to normalise on."""
+    reading: dict[str, Any] = {"eos": loaded.eos, "max_tokens": settings.max_tokens, "notify": warner(report)}
+    pairs = preference_pairs(training_rows(settings, data), loaded.tokenizer, **reading)
+    held: list[Pair] = []
+    if (source := settings.validation if validation is None else validation) is not None:
+        held = preference_pairs(read_rows(source), loaded.tokenizer, **reading)
+    else:
+        pairs, held = hold_out(
+            pairs, settings.held_out, settings.seed, lambda pair: pair.chosen[: pair.prompt_length]
+        )
+    texts = [pair.chosen for pair in pairs]
+    if (source := settings.demonstrations if demonstrations is None else demonstrations) is not None:
+        texts = [example.tokens for example in sft_examples(read_rows(source), loaded.tokenizer, **reading)]
+    order = np.random.default_rng([settings.seed, 2]).permutation(len(texts))[:DEMONSTRATIONS]
+    return pairs, held, [texts[i] for i in order]

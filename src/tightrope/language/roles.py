@@ -1,0 +1,217 @@
+"""Policy, reference, critic and reward model: four roles, one trunk in memory where that is possible.
+
+policy     adapter "policy", the language-model head          (tune full: every weight)
+reference  the bare trunk, the same head                      (tune full: a frozen copy)
+critic     a head on the policy's hidden states | adapter "critic" and a head | a model of its own
+reward     adapter "reward" and a head | a model of its own | a function of the text
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tightrope.algorithms.batch import Batch, Evaluation
+from tightrope.language import lora
+from tightrope.language.ledger import available_memory, check, job_of, ledger
+from tightrope.language.models import eos_ids, find_model, load_causal, load_tokenizer, parts
+from tightrope.language.settings import AlignSettings
+from tightrope.language.token_stats import Sampling, token_statistics
+from tightrope.language.trunk import Trunk
+
+
+@dataclass
+class Roles:
+    """The models of an alignment run. ``trunk`` is the policy's; what is None shares it."""
+
+    tokenizer: Any
+    trunk: Trunk
+    reference: Trunk | None
+    critic: Trunk | None
+    critic_head: nn.Linear | None
+    settings: AlignSettings
+    sampling: Sampling
+    eos: tuple[int, ...]
+
+    @property
+    def model(self) -> Any:
+        """The policy's model."""
+        return self.trunk.model
+
+    def frozen_policy(self) -> contextlib.AbstractContextManager[None]:
+        """Inside, the model is the policy as it is now, its adapter folded in: to sample and to look, no
+        gradients.
+        """
+        return lora.folded(self.model, "policy" if self.reference is None else None)
+
+    def policy_hidden(self, tokens: Tensor, real: Tensor, lower: Tensor | None) -> Tensor:
+        """The policy's hidden states [B, T, d]."""
+        with lora.using(self.model, "policy" if self.reference is None else None):
+            return self.trunk.hidden(tokens, real, lower)
+
+    @torch.no_grad()
+    def reference_hidden(self, tokens: Tensor, real: Tensor, lower: Tensor | None) -> Tensor:
+        """The reference's hidden states [B, T, d]."""
+        if self.reference is not None:
+            return self.reference.hidden(tokens, real)
+        with lora.using(self.model, None):
+            return self.trunk.hidden(tokens, real, lower)
+
+    def adapter_hidden(self, name: str, tokens: Tensor, real: Tensor, lower: Tensor | None) -> Tensor:
+        """Hidden states [B, T, d] with an adapter of the shared trunk."""
+        with lora.using(self.model, name):
+            return self.trunk.hidden(tokens, real, lower)
+
+    def critic_hidden(self, policy: Tensor, tokens: Tensor, real: Tensor, lower: Tensor | None) -> Tensor:
+        """The hidden states from which the critic's head reads values; ``policy``: the policy's own."""
+        if self.critic is not None:
+            return self.critic.hidden(tokens, real)
+        return (
+            policy if self.settings.critic == "head" else self.adapter_hidden("critic", tokens, real, lower)
+        )
+
+    def head_of_reference(self) -> nn.Linear:
+        """The reference's language-model head; the policy's own where that is frozen."""
+        return self.trunk.parts.head if self.reference is None else self.reference.parts.head
+
+    def critic_parameters(self) -> list[nn.Parameter]:
+        """What the critic alone trains."""
+        found = [] if self.critic_head is None else list(self.critic_head.parameters())
+        if self.critic is not None:
+            found += list(self.critic.parts.base.parameters())
+        elif self.settings.critic == "adapter":
+            found += lora.adapter_parameters(self.model, "critic")
+        return found
+
+    def parameters(self) -> list[nn.Parameter]:
+        """Everything that is trained: the policy's weights or adapter, then the critic's."""
+        own = (
+            list(self.model.parameters())
+            if self.settings.tune == "full"
+            else lora.adapter_parameters(self.model, "policy")
+        )
+        return own + self.critic_parameters()
+
+
+def make_roles(
+    settings: AlignSettings,
+    reward_adapter: Path | None = None,
+    notify: Callable[[str], None] = print,
+    *,
+    own_reward: bool = False,
+) -> Roles:
+    """Load and arrange the models. ``reward_adapter``: a reward model's adapter for this very trunk;
+    ``own_reward``: a reward model with a trunk of its own will stand beside them.
+
+    The memory ledger is handed to ``notify`` before anything large is loaded; what cannot fit is a
+    ValueError.
+    """
+    folder, dtype, device = find_model(settings.model), getattr(torch, settings.dtype), settings.device
+    kind = "separate" if own_reward else "none" if reward_adapter is None else "adapter"
+    present_memory(folder, settings, kind, notify)
+    tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
+    stops, cut, reference, critic = eos_ids(model, tokenizer), 0, None, None
+    if settings.tune == "lora":
+        layers = lora.top_layers(model, settings.lora_layers)
+        cut = layers[0]
+        for number, name in enumerate(["policy"] + ["critic"] * (settings.critic == "adapter")):
+            seed = settings.seed * 10 + number
+            lora.add_adapter(model, name, settings.lora_rank, settings.lora_alpha, layers, seed)
+        if reward_adapter is not None:
+            lora.load_adapter(model, "reward", reward_adapter)
+            cut = min(cut, lowest_layer(model, "reward"))
+    else:
+        reference = Trunk(load_causal(folder, dtype).to(device).requires_grad_(False))
+    checkpointing = settings.gradient_checkpointing
+    if settings.critic == "separate":
+        critic = Trunk(load_causal(folder, dtype).to(device), checkpointing=checkpointing)
+    head = None
+    if settings.critic != "none":
+        head = nn.Linear(model.config.hidden_size, 1).to(device)
+        nn.init.zeros_(head.weight)  # the first values are 0, whatever the trunk says
+        nn.init.zeros_(head.bias)
+    sampling = Sampling(settings.temperature, settings.top_k, stops if settings.ignore_eos else ())
+    trunk = Trunk(model, cut, checkpointing=checkpointing)
+    return Roles(tokenizer, trunk, reference, critic, head, settings, sampling, stops)
+
+
+def present_memory(folder: str, settings: AlignSettings, reward: str, notify: Callable[[str], None]) -> None:
+    """Say what the job will take, and refuse it with advice when it cannot fit: before weights are loaded."""
+    from transformers import AutoConfig
+
+    extra = settings.ptx_per_response * (settings.max_prompt_tokens + settings.max_new_tokens)
+    job = job_of(settings, reward=reward, extra_tokens=extra if settings.ptx_weight else 0)
+    found = ledger(AutoConfig.from_pretrained(folder), job)
+    notify(found.text())
+    check(found, available_memory(settings.device))
+
+
+def lowest_layer(model: Any, name: str) -> int:
+    """The index of the lowest decoder layer that an adapter changes."""
+    for index, layer in enumerate(parts(model).layers):
+        if name in lora.adapter_names(layer):
+            return index
+    raise ValueError(f"The model has no adapter {name!r}.")
+
+
+class PolicyModel:
+    """What ppo.update trains: Batch -> Evaluation, each [B, R]; padding is cut off before the forward pass.
+
+    ``exact``: also the exact KL to the reference of every state, left in ``kl`` for the loss ([B, R]).
+    """
+
+    def __init__(self, roles: Roles, *, exact: bool = False, critic_alone: bool = False) -> None:
+        self.roles, self.exact, self.critic_alone = roles, exact, critic_alone
+        self.kl: Tensor | None = None
+
+    def __call__(self, part: Batch) -> Evaluation:
+        """Log-probabilities and entropies of the policy, and the critic's values, where the mask is True."""
+        roles, mask = self.roles, part.mask
+        columns, length = mask.shape[1], part.inputs["tokens"].shape[1]
+        left, right = trimmed(part.inputs["real"], mask)
+        tokens, real = (part.inputs[name][:, left:right] for name in ("tokens", "real"))
+        lower = part.inputs["lower"][:, left:right] if "lower" in part.inputs else None
+        first = length - columns - left - 1  # the state in which the first response token is chosen
+        here = mask[:, : right - length + columns]
+
+        def steps(hidden: Tensor) -> Tensor:
+            return hidden[:, first : first + here.shape[1]][here]
+
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.critic_alone):
+            hidden = roles.policy_hidden(tokens, real, lower)
+        support = part.inputs.get("support")
+        reference = part.inputs.get("ref_hidden") if self.exact else None
+        found = token_statistics(
+            steps(hidden), roles.trunk.parts.head, part.actions[mask], roles.sampling,
+            support=None if support is None else support[mask],
+            reference=None if reference is None else reference[mask],
+            reference_head=roles.head_of_reference(),
+        )  # fmt: skip
+        values = found.logp.new_zeros(len(found.logp))
+        if roles.critic_head is not None:
+            critic = roles.critic_hidden(hidden, tokens, real, lower)
+            values = roles.critic_head(steps(critic).float())[:, 0]
+        logp, entropy, kl, values = (_spread(x, mask) for x in (*found, values))
+        self.kl = kl
+        return Evaluation(logp, entropy, values)
+
+
+def _spread(x: Tensor, mask: Tensor) -> Tensor:
+    """[N] numbers of the counting steps -> [B, R], 0 elsewhere."""
+    return torch.zeros(mask.shape, dtype=x.dtype, device=x.device).masked_scatter(mask, x)
+
+
+def trimmed(real: Tensor, mask: Tensor) -> tuple[int, int]:
+    """The columns [left, right) of [B, P + R] that hold a real prompt token or a counting response token."""
+    prompt = real.shape[1] - mask.shape[1]
+    any_prompt = real[:, :prompt].any(0).nonzero()
+    any_response = mask.any(0).nonzero()
+    left = int(any_prompt[0]) if len(any_prompt) else prompt - 1
+    right = prompt + (int(any_response[-1]) + 1 if len(any_response) else 1)
+    return left, right

@@ -1,0 +1,163 @@
+"""Who judges responses: a reward model on the policy's own trunk, one with a trunk of its own, or
+functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tightrope.language.collect import Experience
+from tightrope.language.data import Prompt
+from tightrope.language.reward_model import RewardModel, last_real, load_reward
+from tightrope.language.rewards import Rewards, Scores, load_reward_function
+from tightrope.language.roles import Roles
+
+
+class Judge:
+    """Scores of whole responses, from functions of the text and from a reward model, weighted and added up.
+
+    ``adapter``: a reward adapter on the policy's trunk with its head [1, d] and shift; ``model``: one with a
+    trunk of its own, which must know the policy's tokens.
+    """
+
+    def __init__(
+        self,
+        roles: Roles,
+        functions: Rewards | None = None,
+        model: RewardModel | None = None,
+        adapter: tuple[Tensor, float] | None = None,
+    ) -> None:
+        self.roles, self.functions, self.model, self.adapter = roles, functions, model, adapter
+
+    def __call__(
+        self, prompts: Sequence[Prompt], experience: Experience, trainer_state: Any = None
+    ) -> Scores:
+        """Scores of the responses to ``prompts``, one prompt a response."""
+        found = self._of_functions(prompts, experience, trainer_state)
+        learnt = self._of_model(experience)
+        if learnt is None:
+            assert found is not None
+            return found
+        good = np.isfinite(learnt)
+        if found is None:
+            metrics: dict[str, float] = {}
+            return Scores(np.where(good, learnt, np.nan), good, {"reward_model": learnt}, metrics, {})
+        parts = {**found.parts, "reward_model": learnt}
+        return replace(found, total=found.total + learnt, valid=found.valid & good, parts=parts)
+
+    def _of_functions(self, prompts: Sequence[Prompt], experience: Experience, state: Any) -> Scores | None:
+        if self.functions is None:
+            return None
+        ids = experience.ids()
+        texts = [self.roles.tokenizer.decode(row, skip_special_tokens=True) for row in ids]
+        completions = [
+            text if isinstance(prompt.shown, str) else [{"role": "assistant", "content": text}]
+            for prompt, text in zip(prompts, texts, strict=True)
+        ]
+        names = {name for prompt in prompts for name in prompt.columns}
+        columns = {name: [prompt.columns.get(name) for prompt in prompts] for name in sorted(names)}
+        return self.functions.score([p.shown for p in prompts], completions, ids, columns, state)
+
+    @torch.no_grad()
+    def _of_model(self, experience: Experience) -> np.ndarray | None:
+        if self.model is None and self.adapter is None:
+            return None
+        size = self.roles.settings.update.micro_batch_size or len(experience.tokens)
+        scores = []
+        for start in range(0, len(experience.tokens), size):
+            rows = slice(start, start + size)
+            tokens, real = experience.tokens[rows], experience.real[rows]
+            if self.model is not None:
+                scores.append(self.model.score(tokens, real).float())
+                continue
+            assert self.adapter is not None
+            head, shift = self.adapter
+            lower = None if experience.lower is None else experience.lower[rows]
+            hidden = self.roles.adapter_hidden("reward", tokens, real, lower)
+            scores.append((last_real(hidden, real).float() @ head.float().T)[:, 0] - shift)
+        return torch.cat(scores).double().cpu().numpy()
+
+
+def is_folder(reward: Any) -> bool:
+    """Whether a reward, or one of several, is the folder of a reward model."""
+    entries = reward if isinstance(reward, list) else [reward]
+    return any(isinstance(entry, str | Path) and Path(entry).is_dir() for entry in entries)
+
+
+def reward_adapter(words: Any) -> Path | None:
+    """The adapter folder of a reward model that was trained with LoRA, None for any other reward."""
+    for entry in words if isinstance(words, list) else [words]:
+        if isinstance(entry, str | Path) and (Path(entry) / "adapter" / "adapter_config.json").is_file():
+            return Path(entry) / "adapter"
+    return None
+
+
+def shares_trunk(adapter: Path, model: str) -> bool:
+    """Whether a reward adapter was trained on the very model that is aligned."""
+    import json
+
+    named = json.loads((adapter / "adapter_config.json").read_text(encoding="utf-8"))[
+        "base_model_name_or_path"
+    ]
+    return bool(named) and Path(named).resolve() == Path(model).resolve()
+
+
+def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: float | None) -> Judge:
+    """A judge from what the user gave: a function, (function, weight), words of the command line, or several.
+
+    ``on_trunk``: the folder of the adapter that `make_roles` has put on the trunk.
+    """
+    entries = list(reward) if isinstance(reward, list) else [reward]
+    functions: list[Any] = []
+    model, adapter = None, None
+    for entry in entries:
+        if isinstance(entry, str | Path) and Path(entry).is_dir():
+            if model is not None or adapter is not None:
+                raise ValueError("Two reward models were given; expected one, and any number of functions.")
+            if on_trunk is not None and reward_adapter(entry) == on_trunk:
+                adapter = read_head(on_trunk, roles)
+            else:
+                model = load_reward(Path(entry)).to(roles.settings.device)
+                _same_tokens(model, roles, entry)
+        elif isinstance(entry, str):
+            functions.append(load_reward_function(entry))
+        elif callable(entry) or (isinstance(entry, tuple) and len(entry) == 2):
+            functions.append(entry)
+        else:
+            raise ValueError(
+                f"reward is {entry!r}; expected a function, (function, weight), 'length', FILE.py:function, "
+                "or the folder of a reward model."
+            )
+    return Judge(roles, Rewards(functions, timeout=timeout) if functions else None, model, adapter)
+
+
+def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:
+    """The score head [1, d] and the shift that lie beside a reward adapter."""
+    from safetensors.torch import load_file
+
+    tensors = load_file(adapter / "head.safetensors")
+    head = tensors["score.weight"].to(next(roles.model.parameters()).device)
+    return head, float(tensors["shift"])
+
+
+def _same_tokens(model: RewardModel, roles: Roles, folder: Any) -> None:
+    theirs, ours = model.tokenizer.get_vocab(), roles.tokenizer.get_vocab()
+    if theirs != ours:
+        raise ValueError(
+            f"The reward model {folder} reads {len(theirs)} tokens, the policy writes {len(ours)} others. "
+            "Wrap it in a reward function of the text, or train it from the policy's own model."
+        )
+
+
+def value_head_from(adapter: tuple[Tensor, float], head: nn.Linear) -> None:
+    """Begin a critic with a reward head: V = score at first."""
+    with torch.no_grad():
+        head.weight.copy_(adapter[0])
+        head.bias.fill_(-adapter[1])

@@ -1,0 +1,287 @@
+"""The settings of the language story: one frozen dataclass a command, imported without torch."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Self
+
+from tightrope.algorithms.settings import PPOSettings, Schedule, check_ranges, setting
+
+Tune = Literal["lora", "full"]
+# kl_adapt and the KL-penalised surrogate are the control story's; here kl_beta weighs the KL to the reference
+NOT_HERE = ("kl_beta", "kl_adapt", "recompute_advantages")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSettings:
+    """Which model, which of its weights are trained, and where."""
+
+    model: str = setting("glassllm", "Folder or hub id of the model, or a packaged one: glassllm, smollm2.")
+    tune: Tune = setting(
+        "lora", "Train low-rank adapters on a frozen trunk, or every weight.", choices=("lora", "full")
+    )
+    lora_rank: int = setting(16, "Rank of the adapters.", at_least=1)
+    lora_alpha: float = setting(32.0, "Adapters are scaled by lora_alpha / lora_rank.", above=0)
+    lora_layers: int | None = setting(
+        None,
+        "Adapt this many of the top layers; what lies below is computed once for all. none: every layer.",
+        at_least=1,
+    )
+    seed: int = setting(0, "Seed of everything random.", at_least=0)
+    device: str = setting("cpu", "Torch device: cpu, cuda, cuda:1, mps.")
+    dtype: str = setting("float32", "Precision of the trunk.", choices=("float32", "bfloat16"))
+    threads: int | None = setting(None, "CPU threads of torch; none: every core.", at_least=1)
+    gradient_checkpointing: bool = setting(
+        False, "Compute activations again in the backward pass: less memory, a third more time."
+    )
+
+    def __post_init__(self) -> None:
+        """Check every field against its range."""
+        check_ranges(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupervisedSettings(ModelSettings):
+    """What supervised fine-tuning and reward modelling share."""
+
+    data: str = setting("", "The training examples: a .jsonl, .json, .csv or .txt file, or a dataset's id.")
+    validation: str | None = setting(None, "Held-out examples; none: a share of the data is held out.")
+    held_out: float = setting(0.05, "Share of the data that is held out.", at_least=0, at_most=0.5)
+    max_examples: int | None = setting(None, "Use this many examples at most; none: all.", at_least=1)
+    max_tokens: int = setting(128, "Longer examples are cut to this many tokens.", at_least=2)
+    num_epochs: int = setting(1, "Passes over the data.", at_least=1)
+    minibatch_size: int = setting(16, "Examples per optimiser step.", at_least=1)
+    micro_batch_size: int | None = setting(
+        None, "Examples per forward pass; the gradient stays the same. none: the minibatch.", at_least=1
+    )
+    learning_rate: float = setting(1e-4, "Adam's step size.", above=0)
+    learning_rate_schedule: Schedule = setting(
+        "linear", "How the learning rate falls over the run.", choices=("constant", "linear", "cosine")
+    )
+    max_grad_norm: float | None = setting(1.0, "Limit on the norm of the gradient; none: no limit.", above=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SFTSettings(SupervisedSettings):
+    """Supervised fine-tuning on text, prompt and completion, or chats."""
+
+    on_completions: bool = setting(True, "Learn completions and assistant turns alone, not prompts.")
+    pack: bool = setting(False, "Put several examples into one row; none sees another.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardSettings(SupervisedSettings):
+    """A reward model from preferences (Bradley-Terry)."""
+
+    demonstrations: str | None = setting(
+        None, "Texts on which scores get mean 0 and deviation 1; none: the chosen responses."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RLHFSettings(PPOSettings):
+    """PPO on responses: the defaults that language wants."""
+
+    gamma: float = setting(1.0, "Discount per token; 1 in language.", above=0, at_most=1)
+    num_epochs: int = setting(4, "Passes over each batch of responses.", at_least=1)
+    minibatch_size: int = setting(64, "Responses per optimiser step.", at_least=1)
+    learning_rate: float = setting(3e-4, "Adam's step size (1e-5 is usual with --tune full).", above=0)
+    max_grad_norm: float | None = setting(1.0, "One joint limit on the norm of all gradients.", above=0)
+    value_weight: float = setting(0.1, "Weight of the value loss in the total loss.", at_least=0)
+    micro_batch_size: int | None = setting(
+        None, "Responses per forward pass; splits a minibatch to save memory, the gradient is the same.",
+        at_least=1,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignSettings(ModelSettings):
+    """PPO on a causal language model against any reward."""
+
+    data: str = setting("", "The prompts: a .jsonl, .json, .csv or .txt file, or a dataset's id.")
+    reward: str = setting("", "length, FILE.py:function, or the folder of a reward model.")
+    update: RLHFSettings = dataclasses.field(
+        default_factory=RLHFSettings, metadata={"doc": "The update rule's."}
+    )
+    total_episodes: int = setting(4096, "Responses to train on; never exceeded.", at_least=1)
+    batch_size: int = setting(64, "Responses per iteration.", at_least=1)
+    samples_per_prompt: int = setting(1, "Responses to each prompt; they share its KV cache.", at_least=1)
+    max_new_tokens: int = setting(24, "Tokens of a response at most.", at_least=1)
+    max_prompt_tokens: int = setting(64, "Longer prompts lose their beginning.", at_least=1)
+    temperature: float = setting(1.0, "Of sampling and training alike.", above=0)
+    top_k: int = setting(0, "Sample among the k likeliest tokens, in training too; 0: all.", at_least=0)
+
+    kl_beta: float = setting(0.05, "Weight of the KL to the reference; 0.02 to 0.2 is usual.", at_least=0)
+    kl: str = setting(
+        "k1-reward",
+        "Where the KL acts: in the reward (k1), exact and split, or in the loss alone.",
+        choices=(
+            "k1-reward", "exact-split", "k2-loss", "exact-loss",
+            "k2-reward", "k3-reward", "exact-reward", "k1-loss", "k3-loss",
+        ),
+    )  # fmt: skip
+    allow_biased_kl: bool = setting(False, "Accept a form of KL whose gradient is known to be wrong.")
+    kl_goal: float | None = setting(
+        None, "Adapt kl_beta towards this KL per response, in nats (Ziegler: 6); none: fixed.", above=0
+    )
+    kl_horizon: float = setting(10_000.0, "Responses over which kl_beta adapts.", above=0)
+    kl_budget: float | None = setting(None, "Stop at this KL per response, in nats; none: go on.", above=0)
+
+    critic: str = setting(
+        "head",
+        "A head on the policy, an adapter of its own, a model of its own, or none: the other samples' mean.",
+        choices=("head", "adapter", "separate", "none"),
+    )
+    critic_from_reward: bool = setting(False, "Begin the critic with the reward model's weights.")
+    critic_warmup: int = setting(0, "Iterations in which the critic alone learns.", at_least=0)
+    critic_lambda: float | None = setting(
+        None, "GAE's lambda of the critic's targets (VC-PPO: 1); none: gae_lambda.", at_least=0, at_most=1
+    )
+    lambda_alpha: float | None = setting(
+        None, "Lambda = max(0, 1 - 1 / (this * length)) per response (VAPO: 0.05); none: off.", above=0
+    )
+
+    reward_scale: float = setting(1.0, "Scores are multiplied by this.", above=0)
+    reward_clip: float | None = setting(None, "Scores are kept within +- this; none: off.", above=0)
+    whiten_rewards: bool = setting(False, "Divide rewards by their deviation; the mean stays.")
+    missing_eos_penalty: float | None = setting(
+        None, "Subtracted from the score of a response without EOS; none: off.", at_least=0
+    )
+    ignore_eos: bool = setting(False, "Sample max_new_tokens always; EOS is never chosen.")
+    truncation: str = setting(
+        "terminal",
+        "A response cut at max_new_tokens ends there, or goes on in the critic's eyes.",
+        choices=("terminal", "bootstrap"),
+    )
+    ptx_weight: float = setting(0.0, "Weight of the pretraining loss (InstructGPT: 27.8).", at_least=0)
+    ptx_data: str | None = setting(None, "Texts of the pretraining loss.")
+    ptx_per_response: int = setting(1, "Pretraining texts per response (InstructGPT: 8).", at_least=1)
+    reward_timeout: float | None = setting(
+        60.0, "Seconds a reward function may take; its samples are left out then. none: forever.", above=0
+    )
+    evaluate_every: float | None = setting(
+        0.05, "Fraction of the run between gold scores on held-out prompts.", above=0, at_most=1
+    )
+    checkpoint_every: float | None = setting(
+        0.25, "Fraction of the run between checkpoints; none: only the last.", above=0, at_most=1
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges, and the settings that must fit each other."""
+        check_ranges(self)
+        if not isinstance(self.update, RLHFSettings):
+            raise ValueError(f"update is {type(self.update).__name__}; expected RLHFSettings.")
+        if self.batch_size % self.samples_per_prompt:
+            raise ValueError(
+                f"batch_size {self.batch_size} is no multiple of samples_per_prompt "
+                f"{self.samples_per_prompt}. Choose one that is."
+            )
+        if self.kl_goal is not None and not (self.kl_beta > 0 and self.kl_horizon > 0.2 * self.batch_size):
+            raise ValueError(
+                f"kl_goal adapts kl_beta, which is {self.kl_beta:g}, over kl_horizon {self.kl_horizon:g} "
+                "responses; expected kl_beta above 0 and a horizon above a fifth of batch_size "
+                f"{self.batch_size}."
+            )
+        if self.critic == "none" and self.samples_per_prompt < 2:
+            raise ValueError(
+                "critic none compares the responses to one prompt; samples_per_prompt is 1. Give "
+                "--samples-per-prompt 4, or a critic."
+            )
+        if self.critic == "adapter" and self.tune == "full":
+            raise ValueError(
+                "critic adapter needs the frozen trunk of --tune lora. With --tune full use head or separate."
+            )
+        biased = self.kl not in ("k1-reward", "exact-split", "k2-loss", "exact-loss")
+        if biased and not self.allow_biased_kl:
+            raise ValueError(
+                f"kl {self.kl!r} has a gradient that is not the KL's. Use k1-reward or exact-split, or say "
+                "--allow-biased-kl to see what it does."
+            )
+        if self.ptx_weight and self.ptx_data is None:
+            raise ValueError("ptx_weight needs texts: give ptx_data, or ptx_weight 0.")
+
+    def with_values(self, **values: Any) -> Self:
+        """The same settings with these changed; names of the update rule's fields are found there."""
+        outer = {field.name for field in dataclasses.fields(self)}
+        inner = {name: value for name, value in values.items() if name not in outer}
+        own = {name: value for name, value in values.items() if name in outer}
+        known = {field.name for field in dataclasses.fields(RLHFSettings)} - set(NOT_HERE)
+        unknown = sorted(set(inner) - known)
+        if unknown:
+            import difflib
+
+            near = difflib.get_close_matches(unknown[0], known | outer, n=1)
+            hint = f" Did you mean {near[0]}?" if near else ""
+            raise ValueError(f"align has no setting named {', '.join(unknown)}.{hint}")
+        own["update"] = dataclasses.replace(own.get("update", self.update), **inner)
+        return dataclasses.replace(self, **own)
+
+    def risks(self) -> list[str]:
+        """What is unusual about these settings and why it is risky; they are run as asked all the same."""
+        found = []
+        if self.kl_beta == 0 and self.kl_budget is None:
+            found.append(
+                "kl_beta is 0 and there is no kl_budget: nothing holds the policy near the reference, and "
+                "it will learn to exploit the reward's mistakes. Usual: 0.02 to 0.2."
+            )
+        if self.tune == "full" and self.update.learning_rate > 5e-5:
+            found.append(
+                f"learning_rate {self.update.learning_rate:g} is high for every weight of a language model. "
+                "Usual with tune full: 1e-6 to 1e-5 (tiny models stand more)."
+            )
+        return found
+
+
+class Recipe(NamedTuple):
+    """Settings that somebody published, and where."""
+
+    values: dict[str, Any]
+    source: str
+
+
+RECIPES: dict[str, Recipe] = {
+    "ziegler2019": Recipe(
+        {
+            "kl_beta": 0.15, "kl_goal": 6.0, "kl_horizon": 10_000.0, "temperature": 0.7, "num_epochs": 4,
+            "value_clip": 0.2, "value_weight": 0.1, "whiten_rewards": True, "critic": "head",
+            "max_new_tokens": 24,
+            "ignore_eos": True, "learning_rate": 1e-5, "batch_size": 512, "minibatch_size": 512,
+        },
+        "Ziegler et al. 2019, arXiv 1909.08593; lm-human-preferences, launch.py",
+    ),
+    "instructgpt": Recipe(
+        {
+            "kl_beta": 0.02, "temperature": 1.0, "num_epochs": 1, "batch_size": 512, "minibatch_size": 64,
+            "critic": "separate", "critic_from_reward": True, "tune": "full", "learning_rate": 8e-6,
+            "critic_learning_rate": 9e-6, "learning_rate_schedule": "constant", "ptx_weight": 27.8,
+            "ptx_per_response": 8,
+        },
+        "Ouyang et al. 2022, arXiv 2203.02155, appendix C",
+    ),
+    "nplus": Recipe(
+        {
+            "kl_beta": 0.05, "temperature": 0.7, "num_epochs": 4, "batch_size": 512, "minibatch_size": 512,
+            "value_clip": 0.2, "value_weight": 0.1, "critic": "separate", "critic_from_reward": True,
+            "tune": "full", "learning_rate": 3e-6, "missing_eos_penalty": 1.0, "max_new_tokens": 53,
+        },
+        "Huang et al. 2024, arXiv 2403.17031",
+    ),
+    "ppo-max": Recipe(
+        {
+            "kl_beta": 0.05, "batch_size": 128, "minibatch_size": 32, "num_epochs": 1, "value_clip": 0.2,
+            "critic": "separate", "critic_from_reward": True, "tune": "full", "learning_rate": 5e-7,
+            "critic_learning_rate": 1.65e-6, "reward_clip": 10.0, "critic_warmup": 10,
+        },
+        "Zheng et al. 2023, Secrets of RLHF I, arXiv 2307.04964",
+    ),
+    "vapo": Recipe(
+        {
+            "kl_beta": 0.0, "clip": 0.2, "clip_high": 0.28, "critic_lambda": 1.0, "lambda_alpha": 0.05,
+            "critic": "separate", "critic_from_reward": True, "critic_warmup": 50, "tune": "full",
+            "learning_rate": 1e-6, "critic_learning_rate": 2e-6, "samples_per_prompt": 16,
+            "batch_size": 8192, "minibatch_size": 512, "num_epochs": 1,
+        },
+        "Yue et al. 2025, VAPO, arXiv 2504.05118",
+    ),
+}  # fmt: skip

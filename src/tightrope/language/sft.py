@@ -1,0 +1,154 @@
+"""The first stage: supervised fine-tuning of a causal language model on text, completions or chats.
+
+L = - sum over learnt tokens of log p(token | what stands before it) / their number in the minibatch
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tightrope.language import lora
+from tightrope.language.data import Example, Row, read_rows, sft_examples
+from tightrope.language.fitting import (
+    Loaded,
+    Objective,
+    Reporter,
+    announcement,
+    finish,
+    fit,
+    hold_out,
+    load,
+    micro_batches,
+    precision,
+    silent,
+    threads,
+    training_rows,
+    warner,
+)
+from tightrope.language.models import parts
+from tightrope.language.packing import Packed, attention_of, collate, pack, row_of
+from tightrope.language.saving import write_model
+from tightrope.language.settings import SFTSettings
+from tightrope.language.token_stats import Sampling, token_statistics
+from tightrope.runs.run import Run
+
+
+def hidden_states(model: Any, rows: Packed) -> Tensor:
+    """Hidden states [B, N, d] of right-padded rows; no text sees padding, or another text of its row."""
+    base = parts(model).base
+    if not bool((rows.segments > 0).any()):
+        # One text a row: padding stands behind it, where causal attention never looks.
+        return base(input_ids=rows.tokens, use_cache=False).last_hidden_state
+    allowed = attention_of(rows.segments)
+    # Added to the scores by every implementation of attention; some would add a boolean mask as 0 and 1.
+    mask = torch.zeros(allowed.shape, dtype=model.dtype, device=allowed.device)
+    mask.masked_fill_(~allowed, torch.finfo(model.dtype).min)
+    out = base(input_ids=rows.tokens, attention_mask=mask, position_ids=rows.positions, use_cache=False)
+    return out.last_hidden_state
+
+
+def token_loss(model: Any, rows: Packed) -> Tensor:
+    """-log p summed over the learnt tokens, a scalar in nats; divide by ``rows.learn.sum()`` for the mean."""
+    head, targets = parts(model).head, rows.learn[:, 1:]
+    hidden = hidden_states(model, rows)[:, :-1][targets].to(head.weight.dtype)
+    with torch.autocast(hidden.device.type, enabled=False):
+        return -token_statistics(hidden, head, rows.tokens[:, 1:][targets], Sampling()).logp.sum()
+
+
+@torch.no_grad()
+def mean_loss(model: Any, rows: Sequence[Packed], size: int) -> float:
+    """The mean loss per learnt token over all rows, ``size`` rows at a time; nats."""
+    total, count = 0.0, 0
+    for part in micro_batches(rows, size, len):
+        batch = collate(part).to(model.device)
+        total, count = total + float(token_loss(model, batch)), count + int(batch.learn.sum())
+    return total / count
+
+
+def train_sft(
+    settings: SFTSettings,
+    *,
+    data: Any = None,
+    validation: Any = None,
+    model: tuple[Any, Any] | None = None,
+    report: Reporter = silent,
+    run_dir: str | Path | None = None,
+) -> dict[str, Any]:
+    """Fine-tune a model; returns the summary that is also written to the run folder.
+
+    ``data`` and ``validation`` replace the files that the settings name: rows in any format of
+    `sft_examples`. ``model``: a (model, tokenizer) that is trained in place. The run folder holds
+    settings.json, metrics.jsonl, summary.json and ``model``, which AutoModelForCausalLM.from_pretrained
+    loads, with tokenizer and chat template; tuned by LoRA the adapter is folded into it, and lies in
+    ``adapter`` for PEFT as well. Raises ValueError for data or settings that cannot work, before anything is
+    trained.
+    """
+    with threads(settings.threads):
+        loaded = load(settings, "sft", model)
+        with lora.using(loaded.model, loaded.adapter):
+            return _train(settings, loaded, data, validation, report, run_dir)
+
+
+def _train(
+    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, report: Reporter, run_dir: Any
+) -> dict[str, Any]:
+    model, size = loaded.model, settings.micro_batch_size or settings.minibatch_size
+    rows, held = _rows(settings, loaded, data, validation, report)
+
+    def loss(items: Sequence[Packed]) -> tuple[Tensor, dict[str, Tensor]]:
+        with precision(settings):
+            return token_loss(model, collate(items).to(model.device)), {}
+
+    def evaluate() -> dict[str, float]:
+        with precision(settings):
+            return {"sft/held_out_loss": mean_loss(model, held, size)} if held else {}
+
+    parameters = list(model.parameters())
+    if loaded.adapter is not None:
+        parameters = lora.adapter_parameters(model, loaded.adapter)
+    learnt = sum(_learnt(row) for row in rows)
+    objective = Objective("sft", "sft", rows, loss, _learnt, len, evaluate, seen="sft/tokens")
+    name = f"sft-{Path(settings.model).name}-{settings.seed}"
+    with Run.create(run_dir, dataclasses.asdict(settings), name) as run:
+        words = f"{len(rows)} rows, {learnt:,} tokens to learn; {len(held)} rows held out"
+        report("start", announcement(settings, run, loaded, parameters, words))
+        final = fit(objective, parameters, settings, run, report)
+        write_model(model, loaded.tokenizer, run.path / "model", loaded.adapter)
+        if loaded.adapter is not None:
+            lora.save_adapter(model, loaded.adapter, run.path / "adapter", base_model=loaded.source)
+        return finish(settings, run, report, final, rows=len(rows), held_out_rows=len(held), tokens=learnt)
+
+
+def _learnt(row: Packed) -> int:
+    return int(row.learn.sum())
+
+
+def _rows(
+    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, report: Reporter
+) -> tuple[list[Packed], list[Packed]]:
+    """The rows to train on and those held out; packed apart, so that nothing held out is trained on."""
+
+    def examples(source: list[Row]) -> list[Example]:
+        return sft_examples(
+            source,
+            loaded.tokenizer,
+            eos=loaded.eos,
+            max_tokens=settings.max_tokens,
+            on_completions=settings.on_completions,
+            notify=warner(report),
+        )
+
+    own, held = examples(training_rows(settings, data)), []
+    if (source := settings.validation if validation is None else validation) is not None:
+        held = examples(read_rows(source))
+    else:
+        own, held = hold_out(own, settings.held_out, settings.seed)
+    if settings.pack:
+        return pack(own, settings.max_tokens), pack(held, settings.max_tokens)
+    return [row_of([example]) for example in own], [row_of([example]) for example in held]

@@ -1,0 +1,328 @@
+"""The loop of an alignment run: sample -> score -> advantages -> update -> record -> evaluate -> save."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tightrope.algorithms import ppo
+from tightrope.algorithms.batch import Batch, Evaluation
+from tightrope.algorithms.optimise import SamplingMismatch, make_optimiser, set_learning_rates
+from tightrope.language import lora
+from tightrope.language.collect import PromptOrder, describe, gather, rewards_of, to_batch
+from tightrope.language.data import Prompt, read_prompts, read_rows
+from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
+from tightrope.language.models import context_length, find_model
+from tightrope.language.monitor import Monitor
+from tightrope.language.ptx import Pretraining
+from tightrope.language.roles import PolicyModel, Roles, make_roles
+from tightrope.language.samples import sample_rows
+from tightrope.language.saving import save_model, save_state
+from tightrope.language.scoring import (
+    Judge,
+    is_folder,
+    make_judge,
+    reward_adapter,
+    shares_trunk,
+    value_head_from,
+)
+from tightrope.language.settings import AlignSettings
+from tightrope.maths.values import explained_variance
+from tightrope.runs.run import Run
+
+LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
+HELD_OUT_PROMPTS = 64
+Reporter = Callable[[str, dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A finished run: its folder, its summary, and a row of metrics per iteration."""
+
+    path: Path
+    summary: dict[str, Any]
+    metrics: list[dict[str, Any]]
+
+    @property
+    def model(self) -> Path:
+        """The folder that AutoModelForCausalLM.from_pretrained loads."""
+        return self.path / "model"
+
+
+class Trainer:
+    """The state of an alignment run; `iterate` is the loop."""
+
+    def __init__(
+        self, settings: AlignSettings, prompts: Any, reward: Any, gold: Any, report: Reporter
+    ) -> None:
+        self.settings, self.report = settings, report
+        adapter = reward_adapter(reward)
+        shared = (
+            adapter is not None
+            and settings.tune == "lora"
+            and shares_trunk(adapter, find_model(settings.model))
+        )
+        on_trunk = adapter if shared else None
+        self.roles: Roles = make_roles(
+            settings,
+            on_trunk,
+            lambda text: report("line", {"text": text}),
+            own_reward=on_trunk is None and is_folder(reward),
+        )
+        self.prompts = self._read_prompts(prompts)
+        self.judge = make_judge(reward, self.roles, on_trunk=on_trunk, timeout=settings.reward_timeout)
+        self.held_out: list[Prompt] = []
+        self.gold: Judge | None = None
+        if gold is not None:
+            self.gold = make_judge(gold, self.roles, on_trunk=None, timeout=settings.reward_timeout)
+            count = min(HELD_OUT_PROMPTS, len(self.prompts) // 4)
+            self.prompts, self.held_out = self.prompts[: len(self.prompts) - count], self.prompts[-count:]
+        if settings.critic_from_reward and self.roles.critic_head is not None:
+            self._critic_from_reward()
+        self.optimiser = make_optimiser(
+            self.roles.parameters(), self.roles.critic_parameters(), settings.update
+        )
+        self.order = PromptOrder(len(self.prompts), settings.seed)
+        self.update_rng = np.random.default_rng([settings.seed, 9])
+        self.kl_beta = settings.kl_beta
+        self.pretraining = Pretraining.make(settings, self.roles) if settings.ptx_weight else None
+        self.monitor = Monitor(kl_budget=settings.kl_budget)
+        self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
+        self.gold_due, self._told = _grid(settings.evaluate_every, 0.0), set[tuple[str, str]]()
+
+    def _read_prompts(self, source: Any) -> list[Prompt]:
+        settings, limit = self.settings, context_length(self.roles.model)
+        if limit is not None and settings.max_prompt_tokens + settings.max_new_tokens > limit:
+            raise ValueError(
+                f"max_prompt_tokens {settings.max_prompt_tokens} + max_new_tokens {settings.max_new_tokens} "
+                f"exceed the model's context of {limit} tokens. Choose less of either."
+            )
+        rows, longest = read_rows(source), settings.max_prompt_tokens
+        found = read_prompts(rows, self.roles.tokenizer, max_tokens=longest, notify=self._warn)
+        if not found:
+            raise ValueError("There are no prompts. Give a list of texts, or a file with a 'prompt' a row.")
+        return found
+
+    def _warn(self, text: str) -> None:
+        self.report("line", {"text": f"warning: {text}", "warning": True})
+
+    def _critic_from_reward(self) -> None:
+        if self.judge.adapter is None:
+            raise ValueError(
+                "critic_from_reward needs a reward model that was trained with --tune lora from the model "
+                "that is aligned, and --tune lora here. Leave it out, or train such a one."
+            )
+        assert self.roles.critic_head is not None
+        value_head_from(self.judge.adapter, self.roles.critic_head)
+        if self.settings.critic == "adapter":
+            lora.load_adapter_state(
+                self.roles.model, "critic", lora.adapter_state(self.roles.model, "reward")
+            )
+
+    # ------------------------------------------------------------------------------------------ the loop
+
+    def run(self, run: Run) -> Aligned:
+        """Train until the budget is spent; the run folder then holds everything."""
+        settings, begin = self.settings, time.perf_counter()
+        total = {"total_steps": settings.total_episodes}
+        facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self._lines()}
+        self.report("start", {"settings": dataclasses.asdict(settings), **facts, **total})
+        save_due = _grid(settings.checkpoint_every, settings.checkpoint_every)
+        metrics: dict[str, float] = {}
+        with run:
+            for metrics, rows in self.iterate():
+                metrics["time/seconds"] = time.perf_counter() - begin
+                self._watch(metrics)
+                run.record(self.episodes, metrics["time/seconds"], metrics)
+                run.record_samples(rows)
+                event = {"step": self.episodes, "metrics": metrics, "seconds": metrics["time/seconds"]}
+                self.report("update", {**event, **total})
+                if save_due(self.episodes / settings.total_episodes):
+                    save_state(self, run)
+            save_state(self, run)
+            save_model(self.roles, run.path, settings)
+            summary = self._summary(run, metrics)
+            run.finish(summary)
+        self.report("finish", summary)
+        return Aligned(run.path, summary, run.read_metrics())
+
+    def _watch(self, metrics: dict[str, float]) -> None:
+        """Over-optimisation: warn, and stop at the KL budget."""
+        seen = (metrics["objective/kl"], metrics["objective/scores"], metrics.get("eval/gold"))
+        for alarm in self.monitor.add(*seen):
+            self._warn(alarm.text)
+            self.stopped = self.stopped or alarm.stop
+        metrics |= self.monitor.metrics()
+
+    def _summary(self, run: Run, metrics: dict[str, float]) -> dict[str, Any]:
+        shown = ("objective/", "eval/")
+        return {
+            "model": self.settings.model,
+            "seed": self.settings.seed,
+            "episodes": self.episodes,
+            "iterations": self.iteration,
+            "wall_seconds": metrics.get("time/seconds", 0.0),
+            "stopped_early": self.stopped,
+            "run_dir": str(run.path),
+            "final": {name: value for name, value in metrics.items() if name.startswith(shown)},
+        }
+
+    def _lines(self) -> list[str]:
+        settings, trunk = self.settings, self.roles.trunk
+        trained = sum(parameter.numel() for parameter in self.roles.parameters())
+        total = sum(parameter.numel() for parameter in self.roles.model.parameters())
+        shared = (
+            f"; {trunk.cut} of {len(trunk.parts.layers)} layers computed once for all roles"
+            if trunk.cut
+            else ""
+        )
+        return [
+            f"policy: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained{shared}",
+            f"critic: {settings.critic}; KL: {settings.kl}, kl_beta {settings.kl_beta:g}",
+        ]
+
+    def iterate(self) -> Iterator[tuple[dict[str, float], list[dict[str, Any]]]]:
+        """One iteration at a time: its metrics, and its rows for samples.jsonl."""
+        samples = self.settings.samples_per_prompt
+        while self.episodes < self.settings.total_episodes and not self.stopped:
+            left = self.settings.total_episodes - self.episodes
+            count = min(self.settings.batch_size, left) // samples
+            if count == 0:
+                return
+            yield self._one_iteration([self.prompts[i] for i in self.order.take(count)])
+
+    def _one_iteration(self, prompts: Sequence[Prompt]) -> tuple[dict[str, float], list[dict[str, Any]]]:
+        """sample -> score -> advantages -> update."""
+        settings, begin = self.settings, time.perf_counter()
+        present = settings.update.at(self.episodes / settings.total_episodes)
+        set_learning_rates(self.optimiser, present)
+        experience = gather(self.roles, prompts, settings.seed, self.iteration, settings.samples_per_prompt)
+        gathered = time.perf_counter()
+        asked = [prompt for prompt in prompts for _ in range(settings.samples_per_prompt)]
+        scores = self.judge(asked, experience, self._trainer_state())
+        scored = time.perf_counter()
+        self._tell_faults(scores)
+        rewards, self.reward_scale = rewards_of(experience, scores, settings, self.kl_beta)
+        valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
+        batch = to_batch(experience, rewards, valid, settings)
+        metrics = describe(experience, scores, rewards, valid) | scores.metrics
+        self._check_sampling(metrics["objective/sampling_gap"])
+        if self.gold is not None and self.gold_due(self.episodes / settings.total_episodes):
+            metrics["eval/gold"] = self.evaluate()  # of the policy whose KL this rollout tells
+        if len(batch):
+            metrics |= self._update(batch, present)
+            if settings.critic != "none":
+                metrics["train/explained_variance"] = float(
+                    explained_variance(batch.old_values, batch.returns, batch.mask)
+                )
+        metrics["objective/kl_beta"] = self.kl_beta
+        metrics["train/learning_rate"] = present.learning_rate
+        metrics["time/score_seconds"] = scored - gathered
+        metrics["time/update_seconds"] = time.perf_counter() - scored
+        if settings.kl_goal is not None and len(batch):
+            controller = AdaptiveKL(self.kl_beta, settings.kl_goal, settings.kl_horizon)
+            self.kl_beta = controller.next(metrics["objective/kl"], len(asked)).kl_beta
+        self.episodes += len(asked)
+        self.iteration += 1
+        metrics["time/fps"] = float(experience.responses.mask.sum()) / (time.perf_counter() - begin)
+        return metrics, sample_rows(
+            self.roles.tokenizer, asked, experience, scores, batch, valid, self.episodes
+        )
+
+    def _update(self, batch: Batch, present: Any) -> dict[str, float]:
+        """PPO, or the critic alone while it warms up."""
+        warming = self.iteration < self.settings.critic_warmup
+        model = PolicyModel(
+            self.roles, exact=self.settings.kl in ("exact-split", "exact-loss"), critic_alone=warming
+        )
+        if warming:
+            batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
+            present = present.unchecked(entropy_weight=0.0, target_kl=None)
+        limit = LOG_RATIO_LIMIT if self.settings.dtype == "float32" else None
+        kl_weight = self.kl_beta * self.reward_scale  # a KL in the loss is scaled as the rewards were
+        if present.normalise_advantages and not self.settings.kl.endswith("reward"):
+            # one scale for the whole rollout, so that a KL in the loss keeps its price in units of the reward
+            advantages, scale = shared_scale(batch.advantages, batch.mask)
+            batch = dataclasses.replace(batch, advantages=advantages)
+            kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
+        extra = None if warming else self._extra_loss(kl_weight)
+        return ppo.update(
+            model, self.optimiser, batch, present, self.update_rng, extra_loss=extra, log_ratio_limit=limit
+        )
+
+    def _extra_loss(self, kl_weight: float) -> Any:
+        """The KL's share in the loss and the pretraining loss; None when neither is asked for."""
+        form, pretraining = self.settings.kl, self.pretraining
+
+        def extra(
+            model: Any, part: Batch, now: Evaluation, count: Tensor
+        ) -> tuple[Tensor, dict[str, Tensor]]:
+            total, booked = now.logp.new_zeros(()), {}
+            log_ratio = now.logp.detach() - part.old_logp
+            kl = kl_loss(form, now.logp, part.inputs["ref_logp"], model.kl, part.mask, count, log_ratio)
+            if kl is not None:
+                total = total + kl_weight * kl
+                booked["kl_loss"] = kl.detach() * count / part.mask.sum().clamp(min=1) * part.mask
+            if pretraining is not None:
+                loss = pretraining.loss(len(part))
+                total = total + self.settings.ptx_weight * loss * part.mask.sum() / count
+                booked["ptx_loss"] = loss.detach() * part.mask
+            return total, booked
+
+        return extra if not form.endswith("reward") or pretraining is not None else None
+
+    def _check_sampling(self, gap: float) -> None:
+        if self.settings.dtype == "float32" and not gap <= LOG_RATIO_LIMIT:
+            raise SamplingMismatch(
+                f"The log-probabilities of sampling and of the forward pass that trains differ by {gap:.3g} "
+                f"nats (limit {LOG_RATIO_LIMIT:g}). The model computes another distribution with its KV "
+                "cache than without: see tightrope doctor --model."
+            )
+
+    def _tell_faults(self, scores: Any) -> None:
+        """Say once a run for each function and kind why samples are left out; the count is a metric."""
+        for fault in scores.faults:
+            if (fault.function, fault.kind) not in self._told:
+                self._told.add((fault.function, fault.kind))
+                self._warn(fault.text)
+
+    def _trainer_state(self) -> SimpleNamespace:
+        """What TRL's reward functions may look at: iterations so far and in all, passes over the prompts."""
+        return SimpleNamespace(
+            global_step=self.iteration,
+            max_steps=-(-self.settings.total_episodes // self.settings.batch_size),
+            epoch=self.order.position / self.order.count,
+            episode=self.episodes,
+        )
+
+    def evaluate(self) -> float:
+        """The mean gold score of responses to held-out prompts, sampled as in training."""
+        assert self.gold is not None
+        experience = gather(self.roles, self.held_out, self.settings.seed + 1_000_003, 0, 1)
+        scores = self.gold(self.held_out, experience, self._trainer_state())
+        return float(scores.total[scores.valid].mean()) if scores.valid.any() else float("nan")
+
+
+def _grid(fraction: float | None, first: float | None) -> Callable[[float], bool]:
+    """Whether a point of the grid ``first``, ``first + fraction`` ... of the run was reached since the last
+    call.
+    """
+    ahead = {"point": first}
+
+    def due(share: float) -> bool:
+        point = ahead["point"]
+        if fraction is None or point is None or share < point - 1e-9:
+            return False
+        ahead["point"] = (int(share / fraction + 1e-9) + 1) * fraction
+        return True
+
+    return due

@@ -1,0 +1,433 @@
+"""The KL to the reference: a language is written down whole, and expectations are sums over all responses."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from language.tabular import Language, Tabular, advantages_of, gradient_of, objective, with_scores
+from torch import Tensor
+from torch.distributions import Categorical, kl_divergence
+
+from tightrope.algorithms import ppo
+from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.settings import PPOSettings
+from tightrope.language.kl import (
+    BIASED_KL_FORMS,
+    KL_FORMS,
+    AdaptiveKL,
+    bias_of,
+    kl_loss,
+    kl_rewards,
+    kl_steps,
+    needs_exact,
+    shared_scale,
+)
+from tightrope.language.settings import AlignSettings
+from tightrope.maths import returns, statistics, surrogate
+
+ALL_FORMS = (*KL_FORMS, *BIASED_KL_FORMS)
+EXACT = dict(rtol=0, atol=1e-10)
+KL_BETA = 0.3
+
+
+class World:
+    """A policy, a reference and scores over one small language."""
+
+    def __init__(self, seed: int, words: int = 3, length: int = 3) -> None:
+        self.language = Language(words, length)
+        self.policy, self.reference = Tabular(self.language, seed), Tabular(self.language, seed + 100)
+        self.reference.requires_grad_(False)
+        generator = torch.Generator().manual_seed(seed + 200)
+        count = len(self.language.tokens)
+        self.scores = torch.randn(count, generator=generator, dtype=torch.float64)
+
+    @property
+    def right(self) -> Tensor:
+        """The gradient of E[score] - KL_BETA KL by autograd."""
+        return gradient_of(objective(self.policy, self.reference, self.scores, KL_BETA), self.policy)
+
+    @property
+    def of_scores(self) -> Tensor:
+        """The gradient of E[score] alone."""
+        return gradient_of(objective(self.policy, self.reference, self.scores, 0.0), self.policy)
+
+    def per_state(self, *, forward: bool = False, visits: Tensor | None = None) -> Tensor:
+        """The gradient of the states' own KL (or of KL(reference || policy)), states as often as visited."""
+        states = self.language.states(self.language.tokens)
+        pair = [Categorical(logits=model.logits[states]) for model in (self.policy, self.reference)]
+        kl = kl_divergence(*(pair[::-1] if forward else pair))
+        often = self.policy.probabilities().detach() if visits is None else visits
+        return gradient_of(torch.where(self.language.mask, often[:, None] * kl, 0.0).sum(), self.policy)
+
+    def rewards(self, form: str, scores: Tensor) -> Tensor:
+        """Rewards per token of every response: the score at the end, and what the form adds."""
+        tokens, mask = self.language.tokens, self.language.mask
+        with torch.no_grad():
+            parts = (self.policy.logp(tokens), self.reference.logp(tokens))
+            exact = self.policy.exact(tokens, self.reference)
+        return with_scores(kl_rewards(form, KL_BETA, *parts, exact, mask), scores, mask)
+
+    def expected(self, form: str, scores: Tensor, values: Tensor, gae_lambda: float = 1.0) -> Tensor:
+        """The expected gradient (uphill) that training follows: the product's own functions, every response.
+
+        Each response alone is a minibatch with count 1, so that its loss is the sum over its steps.
+        """
+        tokens, mask, policy = self.language.tokens, self.language.mask, self.policy
+        logp, ref_logp = policy.logp(tokens), self.reference.logp(tokens)
+        exact = policy.exact(tokens, self.reference)
+        advantages, _ = advantages_of(self.rewards(form, scores), values, mask, gae_lambda)
+        log_ratio = surrogate.log_ratio(logp, logp.detach(), mask)
+        steps = surrogate.clipped_surrogate(log_ratio, advantages, 0.2)
+        total = torch.zeros((), dtype=torch.float64)
+        for row, p in enumerate(policy.probabilities().detach()):
+            here = slice(row, row + 1)
+            kl = kl_loss(form, logp[here], ref_logp[here], exact[here], mask[here], 1)
+            loss = statistics.masked_mean(steps[here], mask[here], 1)
+            total = total + p * (loss if kl is None else loss + KL_BETA * kl)
+        return -gradient_of(total, policy)
+
+    def some_values(self) -> Tensor:
+        """Values of an arbitrary critic: numbers that depend on the state alone."""
+        return self.policy.values.detach()[self.language.states(self.language.tokens)]
+
+    def true_values(self, form: str) -> Tensor:
+        """Values of a perfect critic: the mean return over all responses that pass a state."""
+        states, mask = self.language.states(self.language.tokens), self.language.mask
+        rewards = self.rewards(form, self.scores)
+        to_go = returns.discounted_returns(rewards, torch.zeros_like(mask), 1.0, mask=mask)
+        weights = self.policy.probabilities().detach()[:, None] * mask
+        sums = torch.zeros(2, self.language.prefixes, dtype=torch.float64)
+        sums[0].index_put_((states[mask],), (weights * to_go)[mask], accumulate=True)
+        sums[1].index_put_((states[mask],), weights[mask], accumulate=True)
+        return torch.where(mask, (sums[0] / sums[1])[states], 0.0)
+
+
+def off_by(found: Tensor, right: Tensor) -> float:
+    """The error of a gradient, relative to its size."""
+    return float((found - right).norm() / right.norm())
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("form", ["k1-reward", "exact-split"])
+def test_expected_gradient_is_that_of_the_objective(form: str, seed: int) -> None:
+    """With any critic, as long as lambda is 1."""
+    world = World(seed)
+    torch.testing.assert_close(world.expected(form, world.scores, world.some_values()), world.right, **EXACT)
+
+
+@pytest.mark.parametrize("form", ["k1-reward", "exact-split"])
+def test_a_perfect_critic_makes_it_exact_at_any_lambda(form: str) -> None:
+    """Rewards lie where the critic expects them: V(s) is the mean of what still follows from s."""
+    world = World(0)
+    found = world.expected(form, world.scores, world.true_values(form), gae_lambda=0.3)
+    torch.testing.assert_close(found, world.right, **EXACT)
+    assert off_by(world.expected(form, world.scores, world.some_values(), gae_lambda=0.3), world.right) > 0.05
+
+
+@pytest.mark.parametrize("form", ["k2-loss", "exact-loss"])
+def test_loss_forms_have_the_gradient_of_the_states_own_kl(form: str) -> None:
+    world = World(1)
+    found = world.expected(form, world.scores, world.some_values())
+    torch.testing.assert_close(found, world.of_scores - KL_BETA * world.per_state(), **EXACT)
+    assert off_by(found, world.right) > 0.05, "later states are not seen, so it cannot be the whole gradient"
+
+
+def test_what_the_biased_forms_really_do() -> None:
+    """Each sentence of BIASED_KL_FORMS as an equation."""
+    world = World(2)
+    values = world.some_values()
+    whole = (world.of_scores - world.right) / KL_BETA  # the gradient of the KL of responses
+
+    def kl_gradient(form: str) -> Tensor:
+        return (world.of_scores - world.expected(form, world.scores, values)) / KL_BETA
+
+    torch.testing.assert_close(kl_gradient("k1-loss"), torch.zeros_like(whole), **EXACT)
+    torch.testing.assert_close(kl_gradient("k3-loss"), world.per_state(forward=True), **EXACT)
+    torch.testing.assert_close(kl_gradient("exact-reward"), whole - world.per_state(), **EXACT)
+    torch.testing.assert_close(kl_gradient("k3-reward"), whole - world.per_state(forward=True), **EXACT)
+    for form in BIASED_KL_FORMS:
+        assert off_by(kl_gradient(form), whole) > 0.2, form
+
+
+def test_one_state_alone() -> None:
+    """Responses of one token: all sound forms agree with autograd, no biased one comes near."""
+    world = World(3, words=5, length=1)
+    for form in KL_FORMS:
+        found = world.expected(form, world.scores, world.some_values())
+        torch.testing.assert_close(found, world.right, **EXACT)
+    whole = world.of_scores - world.right
+    for form in BIASED_KL_FORMS:
+        found = world.of_scores - world.expected(form, world.scores, world.some_values())
+        assert off_by(found, whole) > 0.2, form
+
+
+def test_near_the_reference_k2_and_k3_as_rewards_hold_nothing() -> None:
+    """There the KL is of second order, its gradient of first, and theirs of second."""
+    world = World(4, words=5, length=1)
+    with torch.no_grad():
+        world.policy.logits.copy_(world.reference.logits + 0.01 * world.policy.logits)
+    nothing = torch.zeros_like(world.scores)
+    whole = world.expected("k1-reward", nothing, world.some_values())
+    torch.testing.assert_close(whole, -KL_BETA * world.per_state(), **EXACT)
+    for form in ("k2-reward", "k3-reward"):
+        assert float(world.expected(form, nothing, world.some_values()).norm() / whole.norm()) < 0.05
+
+
+@pytest.mark.parametrize("form", ["k2-loss", "exact-loss", "k3-loss", "k1-loss"])
+def test_weights_make_up_for_actions_of_an_older_policy(form: str) -> None:
+    """Responses are the old policy's; over the states it reached, the gradient is the present policy's."""
+    world, old = World(5), Tabular(Language(3, 3), seed=50)
+    tokens, mask = world.language.tokens, world.language.mask
+    visits = old.probabilities().detach()
+    logp, ref_logp = world.policy.logp(tokens), world.reference.logp(tokens)
+    exact = world.policy.exact(tokens, world.reference)
+    log_ratio = logp - old.logp(tokens)
+
+    def gradient(weights: Tensor | None) -> Tensor:
+        steps = kl_steps(form, logp, ref_logp, exact, mask, weights)
+        assert steps is not None
+        total = (visits[:, None] * steps).sum()
+        (found,) = torch.autograd.grad(total, world.policy.logits, retain_graph=True)
+        return found
+
+    right = world.per_state(visits=visits, forward=form == "k3-loss")
+    if form == "k1-loss":
+        right = torch.zeros_like(right)
+    torch.testing.assert_close(gradient(log_ratio), right, **EXACT)
+    assert torch.equal(gradient(None), gradient(log_ratio)) == (form == "exact-loss")
+
+
+class Rollout:
+    """A batch with every response as often as the policy says it, so that a mean is an expectation.
+
+    Probabilities are 1/2, 1/4 and 1/4 in every state: 64 rows hold all three-token responses in proportion.
+    """
+
+    def __init__(self, seed: int, scores_scale: float = 1.0) -> None:
+        self.world = world = World(seed)
+        generator = torch.Generator().manual_seed(seed)
+        halves = torch.tensor([0.5, 0.25, 0.25], dtype=torch.float64)
+        for row in world.policy.logits.data:
+            row.copy_(halves[torch.randperm(3, generator=generator)].log())
+        world.scores *= scores_scale
+        copies = (64 * world.policy.probabilities().detach()).round().long()
+        assert int(copies.sum()) == 64
+        self.rows = torch.arange(len(copies)).repeat_interleave(copies)
+        self.mask = world.language.mask[self.rows]
+        self.count = int(self.mask.sum())
+
+    def batch(self, form: str) -> Batch:
+        """The batch of an update, with NaN where no step counts."""
+        world, tokens = self.world, self.world.language.tokens[self.rows]
+        values = world.some_values()[self.rows]
+        advantages, targets = advantages_of(world.rewards(form, world.scores)[self.rows], values, self.mask)
+        old_logp = torch.where(self.mask, world.policy.logp(tokens).detach(), torch.nan)
+        return Batch({}, tokens, old_logp, values, advantages, targets, self.mask)
+
+    def step(
+        self, form: str, batch: Batch, *, normalise: bool = False, scale: float | Tensor = 1.0
+    ) -> Tensor:
+        """What one step of ppo.update, a plain gradient step of size 1, changes in the logits."""
+        policy = self.world.policy
+        before = policy.logits.detach().clone()
+
+        def kl(model, part: Batch, now, count: Tensor):
+            parts = (now.logp, self.world.reference.logp(part.actions))
+            exact = model.exact(part.actions, self.world.reference)
+            loss = kl_loss(form, *parts, exact, part.mask, count)
+            return (torch.zeros(()) if loss is None else scale * KL_BETA * loss), {}
+
+        settings = PPOSettings(
+            num_epochs=1, minibatch_size=64, micro_batch_size=7, normalise_advantages=normalise,
+            value_weight=0.0, max_grad_norm=None,
+        )  # fmt: skip
+        optimiser = torch.optim.SGD([policy.logits], lr=1.0)
+        ppo.update(policy, optimiser, batch, settings, np.random.default_rng(0), extra_loss=kl)
+        change = policy.logits.detach() - before
+        policy.logits.data.copy_(before)
+        return change
+
+
+@pytest.mark.parametrize("form", KL_FORMS)
+def test_the_real_update_steps_along_the_objective(form: str) -> None:
+    """Scale and micro-batches included: one factor, responses / steps, for the scores and for the KL."""
+    rollout = Rollout(6)
+    world = rollout.world
+    right = world.of_scores - KL_BETA * world.per_state() if "loss" in form else world.right
+    torch.testing.assert_close(rollout.step(form, rollout.batch(form)), right * 64 / rollout.count, **EXACT)
+
+
+def test_normalised_advantages_keep_the_relation_in_the_reward_and_break_it_in_the_loss() -> None:
+    rollout = Rollout(7, scores_scale=5.0)
+    expected = rollout.world.right * 64 / rollout.count
+
+    def direction_error(found: Tensor) -> float:
+        return off_by(found / found.norm(), expected / expected.norm())
+
+    assert direction_error(rollout.step("k1-reward", rollout.batch("k1-reward"), normalise=True)) < 1e-7
+    split = rollout.batch("exact-split")
+    assert direction_error(rollout.step("exact-split", split, normalise=True)) > 0.02
+    advantages, scale = shared_scale(split.advantages, split.mask)
+    assert float(scale) < 0.5
+    shared = dataclasses.replace(split, advantages=advantages)
+    torch.testing.assert_close(rollout.step("exact-split", shared, scale=scale), scale * expected, **EXACT)
+
+
+def test_shared_scale_has_nothing_to_scale_where_all_is_equal() -> None:
+    mask = torch.tensor([[True, True, False]])
+    for advantages in (torch.tensor([[2.0, 2.0, 9.0]]), torch.zeros(1, 3)):
+        found, scale = shared_scale(advantages, mask)
+        assert float(scale) == 1 and found.tolist() == [[0, 0, 0]]
+    found, scale = shared_scale(torch.tensor([[3.0, 9.0, torch.nan]]), torch.tensor([[True, False, False]]))
+    assert float(scale) == 1 and found.tolist() == [[3, 0, 0]]
+
+
+LOGP, REF_LOGP = torch.tensor([[-1.0, -2.0, 0.0]]), torch.tensor([[-1.5, -1.0, 0.0]])
+KL, MASK = torch.tensor([[0.1, 0.2, 0.0]]), torch.tensor([[True, True, False]])
+
+
+@pytest.mark.parametrize(
+    ("form", "first", "second"),
+    [
+        ("k1-reward", 0.5, -1.0),
+        ("k2-reward", 0.125, 0.5),
+        ("k3-reward", math.exp(-0.5) - 1 + 0.5, math.exp(1) - 1 - 1),
+        ("exact-reward", 0.1, 0.2),
+        ("exact-split", 0.2, 0.0),  # step 0 leads to the state of step 1; step 1 to the end
+        ("k2-loss", 0.0, 0.0),
+        ("exact-loss", 0.0, 0.0),
+    ],
+)
+def test_rewards_by_hand(form: str, first: float, second: float) -> None:
+    found = kl_rewards(form, 0.5, LOGP, REF_LOGP, KL, MASK)
+    torch.testing.assert_close(found, torch.tensor([[-0.5 * first, -0.5 * second, 0.0]]))
+
+
+def test_a_discount_acts_on_the_state_that_follows() -> None:
+    assert kl_rewards("exact-split", 0.5, LOGP, REF_LOGP, KL, MASK, 0.5)[0, 0] == pytest.approx(-0.05)
+    undiscounted = kl_rewards("k1-reward", 0.5, LOGP, REF_LOGP, KL, MASK)
+    assert torch.equal(kl_rewards("k1-reward", 0.5, LOGP, REF_LOGP, KL, MASK, 0.5), undiscounted)
+
+
+@pytest.mark.parametrize(
+    ("form", "first", "second"),
+    [
+        ("k2-loss", 0.125, 0.5),
+        ("exact-loss", 0.1, 0.2),
+        ("exact-split", 0.1, 0.2),
+        ("k1-loss", 0.5, -1.0),
+        ("k3-loss", math.exp(-0.5) - 0.5, math.exp(1) - 2),
+    ],
+)
+def test_losses_by_hand(form: str, first: float, second: float) -> None:
+    """The sum over the steps at hand over the count of all; `kl_steps` are its summands."""
+    assert float(kl_loss(form, LOGP, REF_LOGP, KL, MASK, 8)) == pytest.approx((first + second) / 8)
+    steps = kl_steps(form, LOGP, REF_LOGP, KL, MASK)
+    torch.testing.assert_close(steps, torch.tensor([[first, second, 0.0]]))
+
+
+@pytest.mark.parametrize("form", ["k1-reward", "k2-reward", "k3-reward", "exact-reward"])
+def test_reward_forms_have_no_loss(form: str) -> None:
+    assert kl_steps(form, LOGP, REF_LOGP, KL, MASK) is None
+    assert kl_loss(form, LOGP, REF_LOGP, KL, MASK, 2) is None
+
+
+@pytest.mark.parametrize("form", ALL_FORMS)
+def test_nan_behind_the_mask_changes_nothing(form: str) -> None:
+    def everything(*parts: Tensor) -> list[Tensor]:
+        leaves = [part.clone().requires_grad_() for part in parts]
+        rewards = kl_rewards(form, 0.5, *leaves, MASK)
+        assert not rewards.requires_grad
+        loss = kl_loss(form, *leaves, MASK, 2, leaves[0] - LOGP.mul(0.5))
+        if loss is None:
+            return [rewards]
+        found = torch.autograd.grad(loss, leaves, allow_unused=True)
+        return [rewards, loss, *(g for g in found if g is not None)]
+
+    clean = (LOGP, REF_LOGP, KL)
+    dirty = (torch.where(MASK, part, torch.nan) for part in clean)
+    for a, b in zip(everything(*clean), everything(*dirty), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("form", ["k1-loss", "k2-loss", "k3-loss"])
+def test_no_gradient_reaches_the_reference_or_the_weights(form: str) -> None:
+    logp, ref_logp, log_ratio = (x.clone().requires_grad_() for x in (LOGP, REF_LOGP, LOGP))
+    loss = kl_loss(form, logp, ref_logp, KL, MASK, 2, log_ratio)
+    found = torch.autograd.grad(loss, (logp, ref_logp, log_ratio), allow_unused=True)
+    assert found[0] is not None and found[1] is None and found[2] is None
+
+
+def test_sound_forms_have_no_bias_and_the_others_say_theirs() -> None:
+    assert [bias_of(form) for form in KL_FORMS] == [None] * 4
+    for form in BIASED_KL_FORMS:
+        assert form.split("-")[0] in str(bias_of(form)) and form.split("-")[1] in str(bias_of(form))
+    assert {form for form in ALL_FORMS if needs_exact(form)} == {"exact-split", "exact-loss", "exact-reward"}
+
+
+def test_the_settings_offer_exactly_these_forms() -> None:
+    fields = {field.name: field for field in dataclasses.fields(AlignSettings)}
+    assert set(fields["kl"].metadata["choices"]) == set(ALL_FORMS)
+    assert fields["kl"].default in KL_FORMS
+    for form in KL_FORMS:
+        assert AlignSettings(kl=form).kl == form
+    for form in BIASED_KL_FORMS:
+        assert AlignSettings(kl=form, allow_biased_kl=True).kl == form
+        with pytest.raises(ValueError, match="allow-biased-kl"):
+            AlignSettings(kl=form)
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(ValueError, match="kl is 'k4-reward'; expected k1-reward, exact-split"):
+        kl_rewards("k4-reward", 0.1, LOGP, REF_LOGP, KL, MASK)
+    with pytest.raises(ValueError, match="kl is 'k1'"):
+        kl_loss("k1", LOGP, REF_LOGP, KL, MASK, 2)
+    for needs in ("exact-split", "exact-loss", "exact-reward"):
+        with pytest.raises(ValueError, match="exact is None"):
+            kl_rewards(needs, 0.1, LOGP, REF_LOGP, None, MASK)
+    with pytest.raises(ValueError, match=r"shapes differ: logp \(1, 3\), ref_logp \(3,\)"):
+        kl_rewards("k1-reward", 0.1, LOGP, REF_LOGP[0], None, MASK)
+    with pytest.raises(ValueError, match="count is 0"):
+        kl_loss("k2-loss", LOGP, REF_LOGP, None, MASK, 0)
+    impossible = torch.tensor([[-1.5, -torch.inf, 0.0]])
+    with pytest.raises(ValueError, match="KL to the reference is inf at response 0, step 1"):
+        kl_rewards("k1-reward", 0.1, LOGP, impossible, None, MASK)
+    assert kl_rewards("k1-reward", 0.0, LOGP, impossible, None, MASK).tolist() == [[0, 0, 0]]
+
+
+def test_the_controller_follows_zieglers_equation() -> None:
+    control = AdaptiveKL(0.2, target=6.0, horizon=10_000)
+    assert control.next(6.0, 512) == control
+    assert control.next(6.6, 500).kl_beta == pytest.approx(0.2 * (1 + 0.1 * 500 / 10_000))
+    assert control.next(5.4, 500).kl_beta == pytest.approx(0.2 * (1 - 0.1 * 500 / 10_000))
+    for extreme, sign in ((600.0, 1), (0.0, -1), (-3.0, -1)):
+        assert control.next(extreme, 500).kl_beta == pytest.approx(0.2 * (1 + sign * 0.2 * 500 / 10_000))
+
+
+def test_the_controller_is_its_fields() -> None:
+    """Saved and loaded in the middle it goes on as if it had not been."""
+    first = AdaptiveKL(0.2, 6.0).next(9.0, 64)
+    again = AdaptiveKL(**dataclasses.asdict(first))
+    assert again.next(2.0, 64) == first.next(2.0, 64) and first.kl_beta != 0.2
+
+
+def test_fed_with_the_mean_over_tokens_the_controller_would_only_fall() -> None:
+    """Why the sum over the response matters: 24 tokens at the target are a quarter of a nat per token."""
+    control, wrong = AdaptiveKL(0.2, 6.0), AdaptiveKL(0.2, 6.0)
+    for _ in range(67):
+        control, wrong = control.next(6.0, 512), wrong.next(6.0 / 24, 512)
+    assert control.kl_beta == 0.2
+    assert wrong.kl_beta == pytest.approx(0.1, rel=0.01)
+
+
+def test_the_controllers_mistakes_are_named() -> None:
+    with pytest.raises(ValueError, match=r"kl_beta is 0.0; .* needs a number above 0"):
+        AdaptiveKL(0.0, 6.0)
+    with pytest.raises(ValueError, match="target is nan"):
+        AdaptiveKL(0.1, math.nan)
+    with pytest.raises(ValueError, match="the KL is nan"):
+        AdaptiveKL(0.1, 6.0).next(math.nan, 64)
+    with pytest.raises(ValueError, match="Use a horizon above 200"):
+        AdaptiveKL(0.1, 6.0, horizon=100).next(7.0, 1000)
