@@ -1,4 +1,4 @@
-"""tightrope beside stable-baselines3 (and sbx where it is installed): identical settings, whole processes.
+"""tightrope beside stable-baselines3 (sbx, PureJaxRL): identical settings, whole processes.
 
     python benchmarks/speed.py --peer-python VENV/bin/python   # half an hour; nothing else should run
     python benchmarks/speed.py --quick                         # one pair, a few steps: does it work?

@@ -66,7 +66,7 @@ class Agent:
         self.env = env
         self.environments = _environments(env, self.settings)
         present = self.settings
-        torch_device = torch.device(present.device)
+        torch_device = engines.usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
         threads = present.threads or (available_cores() if layouts[0].image_shapes else 1)
         with limited_threads(threads):  # the QR of the first weights rounds differently with more threads
@@ -109,7 +109,8 @@ class Agent:
             self._fresh = False
         first = True
         while (columns := self._next_columns(budget, start)) > 0:
-            with limited_threads(self.settings.threads or 1):
+            # beside the engine's own two threads BLAS threads only spin: its products are too small to share
+            with limited_threads(1 if self.engine.name == "fused" else self.settings.threads or 1):
                 metrics, episodes = self._one_update(columns, (self.steps - start) / budget, check=first)
             first = False
             yield Progress(self.steps - start, budget, metrics, episodes)
@@ -252,8 +253,9 @@ class Agent:
         return save_agent(self, Path(path))
 
     def close(self) -> None:
-        """Close the environments and end their workers."""
+        """Close the environments, and end their workers and the engine's thread."""
         self.environments.close()
+        self.engine.close()
 
 
 class PPO(Agent):

@@ -110,6 +110,9 @@ class TorchEngine:
         """
         return self.algorithm.update(self.model, optimiser, batch.as_steps(), settings, rng, **more)
 
+    def close(self) -> None:
+        """Nothing to end."""
+
     def check(self, batch: Batch, settings: UpdateSettings) -> str:
         """Nothing to check: this is what the compiled engine is checked against."""
         return ""
@@ -129,7 +132,12 @@ class CompiledEngine:
         self.gae = self.fused.gae
 
     def begin_rollout(self, num_envs: int, rng: np.random.Generator) -> None:
-        """Nothing to prepare."""
+        """Take over parameters whose memory was replaced since the last update."""
+        self.fused.attach()
+
+    def close(self) -> None:
+        """End the helping thread."""
+        self.fused.close()
 
     def act(
         self,
@@ -180,6 +188,17 @@ class CompiledEngine:
         return f"engine check: one minibatch by ppo.py and compiled, largest difference {difference:.1e}"
 
 
+def usable_device(name: str) -> torch.device:
+    """The torch device of that name. ValueError: none on this machine, or torch is built without it."""
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device is {name!r}, which cannot be used here ({reason}). Choose cpu.") from error
+    return device
+
+
 def choose(
     policy: Policy,
     optimiser: torch.optim.Optimizer,
@@ -193,14 +212,14 @@ def choose(
     """
     if settings.engine == "torch":
         return TorchEngine(policy, settings), "engine: torch, as asked"
-    from tightrope.control.engine import compilation_due, unsupported
+    from tightrope.control.engine import compilation_due, unsupported, when_compiled
 
     reason = unsupported(policy, settings.update, policy.device, settings.algorithm)
     if reason is None and settings.compile:
         reason = "--compile"
     if reason is None:
         if compilation_due():
-            notify("compiling the CPU engine: about 15 seconds, once for this installation ...")
+            notify(f"compiling the CPU engine: about 15 seconds, {when_compiled()} ...")
         return CompiledEngine(
             policy, optimiser, threads=min(2, cores)
         ), "engine: fused (compiled for this CPU)"

@@ -109,7 +109,7 @@ def evaluate_run(
     """Evaluate the policy of a run or of a saved folder; see evaluate_agent."""
     from tightrope.control.saving import load
 
-    agent = load(path, env=env, policy=policy, best=best, device=device)
+    agent = load(path, env=env, policy=policy, best=best, device=device, engine="torch")  # nothing is learnt
     try:
         environments = evaluation_environments(agent.env, agent.settings, episodes)
         seed = EVALUATION_SEED if seed is None else seed

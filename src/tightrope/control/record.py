@@ -40,7 +40,7 @@ def record_run(
         os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo without one; read when it is first imported
     from tightrope.control.saving import load
 
-    agent = load(path, env=env, policy=policy, best=best)
+    agent = load(path, env=env, policy=policy, best=best, engine="torch")  # nothing is learnt
     try:
         task = _renderable(agent.env, agent.settings.env)
         target = Path(out) if out is not None else Path(path) / "videos" / f"step-{agent.steps:012d}.mp4"

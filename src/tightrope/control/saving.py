@@ -36,18 +36,27 @@ def save_agent(agent: Agent, folder: Path, *, extra: dict[str, Any] | None = Non
 
 
 def load(
-    path: str | Path, *, env: Any = None, policy: Any = None, best: bool = False, device: str | None = None
+    path: str | Path,
+    *,
+    env: Any = None,
+    policy: Any = None,
+    best: bool = False,
+    device: str | None = None,
+    engine: str | None = None,
 ) -> Agent:
     """The agent of a run folder (its newest policy, ``best``: its best) or of a folder that ``save`` wrote.
 
     ``env``: needed when the saved one was no plain Gymnasium id; another id is a warm start.  ``policy``:
-    needed when the saved policy was a module of your own.
+    needed when the saved policy was a module of your own.  ``engine``: who computes further updates (auto,
+    fused, torch); with another ``device`` it is chosen anew.
     """
     folder = agent_folder(Path(path), best=best)
     tensors, state = checkpoint.load(folder)
     settings = settings_from_json(state["settings"])
-    if device is not None:
-        settings = settings.with_values(device=device)
+    if device is not None and device != settings.device:
+        settings = settings.with_values(device=device, engine="auto")
+    if engine is not None:
+        settings = settings.with_values(engine=engine)
     if state["own_policy"] and policy is None:
         raise ValueError(
             f"{path} holds a policy module of your own. Pass it again: load({str(path)!r}, policy=module)."

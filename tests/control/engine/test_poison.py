@@ -130,3 +130,17 @@ def test_compiled_code_sees_nan_and_infinity():
         poisoned = good.copy()
         poisoned[777] = bad
         assert look(poisoned)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_a_gradient_that_overflows_while_data_weights_and_loss_are_finite(activation, threads):
+    """An input of 1e38 that weights of 0 keep out: finite everywhere but in the gradient of those."""
+    policy, optimiser, settings = make(minibatch_size=320, activation=activation)
+    batch = make_batch(policy)
+    with torch.no_grad():
+        policy.actor[0].weight[:, 0] = 0.0
+        policy.critic[0].weight[:, 0] = 0.0
+    batch.inputs["flat"][..., 0] = 1e38
+    text, same = refuse(policy, optimiser, settings, batch, threads)
+    assert same and "The gradient overflowed" in text

@@ -13,7 +13,7 @@ from tightrope.control.engine.support import unsupported
 if TYPE_CHECKING:
     from tightrope.control.engine.fused import FusedEngine
 
-__all__ = ["FusedEngine", "compilation_due", "unsupported"]
+__all__ = ["FusedEngine", "compilation_due", "unsupported", "when_compiled"]
 
 
 def compilation_due() -> bool:
@@ -22,6 +22,13 @@ def compilation_due() -> bool:
     from tightrope.control.engine.compiled import compilation_due
 
     return compilation_due()
+
+
+def when_compiled() -> str:
+    """How often it compiles, in words: once for an installation, unless its cache is off or not writable."""
+    from tightrope.control.engine.compiled import cache_folder
+
+    return "in every process, as its cache is off" if cache_folder() is None else "once for this installation"
 
 
 def __getattr__(name: str) -> Any:

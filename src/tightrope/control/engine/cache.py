@@ -51,10 +51,10 @@ def cache_folder() -> Path | None:
     config = (numba.config.OPT, numba.config.CPU_NAME, numba.config.CPU_FEATURES)
     versions = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
     state.update(repr((*versions, *config, *machine)).encode())
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    root = base / "tightrope" / "numba"
-    folder = root / state.hexdigest()[:16]
     try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        root = base / "tightrope" / "numba"
+        folder = root / state.hexdigest()[:16]
         base.mkdir(parents=True, exist_ok=True)
         for part in (base / "tightrope", root, folder):
             part.mkdir(mode=0o700, exist_ok=True)
@@ -62,7 +62,7 @@ def cache_folder() -> Path | None:
             if hasattr(os, "getuid") and part.stat().st_uid != os.getuid():
                 return None  # what lies there was not written by this user and would be executed
             part.chmod(0o700)
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: no home directory is known
         return None
     return folder if os.access(folder, os.W_OK) else None
 
@@ -71,7 +71,9 @@ def compilation_due() -> bool:
     """Whether loading the engine will compile it (many seconds) and not read it from the cache (under
     one)."""
     folder = cache_folder()
-    return folder is None or not (folder / _COMPLETE).exists()
+    if folder is None or not (folder / _COMPLETE).exists():
+        return True
+    return not all((folder / name).exists() for name in (folder / _COMPLETE).read_text().split())
 
 
 def mark_complete() -> None:
@@ -81,6 +83,8 @@ def mark_complete() -> None:
         return
     with contextlib.suppress(OSError):
         (folder / _COMPLETE).touch(mode=0o600)
+        entries = sorted(path.name for path in folder.iterdir() if path.name.startswith("tightrope."))
+        (folder / _COMPLETE).write_text("\n".join(entries))
         _prune(folder)
 
 

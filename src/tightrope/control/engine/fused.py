@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import threadpoolctl
 import torch
 
 from tightrope.algorithms import ppo
@@ -56,9 +55,6 @@ class FusedEngine:
         self._homes = [x.ctypes.data for x in (self._flat, self._moment, self._square, self._steps)]
         self._work = [plan.aligned_zeros(self._plan.work_size)]
         self._helper, self._pace = helping.Helper(), helping.Pace(both=threads > 1 and policy.trunk is None)
-        # products this small gain nothing from more threads, and threads that spin take the core of the
-        # other half
-        self._limit = threadpoolctl.threadpool_limits(1, user_api="blas")
         self.attach()
 
     def attach(self) -> None:
@@ -97,9 +93,8 @@ class FusedEngine:
         return part
 
     def close(self) -> None:
-        """End the helping thread and give BLAS its threads back."""
+        """End the helping thread; a later update starts it again."""
         self._helper.stop()
-        self._limit.restore_original_limits()
 
     # --- rollout
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 from typing import Any
 
 import torch
@@ -76,6 +77,8 @@ def _uncovered_network(network: nn.Module | None, *, ends_linear: bool) -> str |
 
 
 def _missing_package() -> str | None:
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        return "NUMBA_DISABLE_JIT"
     for name in ("numba", "scipy"):
         if importlib.util.find_spec(name) is None:
             return f"an installation without {name}"
