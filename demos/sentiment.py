@@ -26,18 +26,24 @@ from typing import Any
 
 GOLD_SHARE, REWARD_SHARE = 0.5, 0.45  # of the labelled reviews; the rest gives prompts
 
-SFT = {"max_tokens": 64, "max_examples": 10_000, "minibatch_size": 32, "learning_rate": 2e-3, "tune": "full"}
-REWARD = {
+SFT_VALUES = {
+    "max_tokens": 64,
+    "max_examples": 10_000,
+    "minibatch_size": 32,
+    "learning_rate": 2e-3,
+    "tune": "full",
+}
+REWARD_VALUES = {
     "max_tokens": 64,
     "max_examples": 12_000,
     "minibatch_size": 32,
     "learning_rate": 1e-3,
     "tune": "full",
 }
-ALIGN = {
+ALIGN_VALUES = {
     "total_episodes": 10_240, "batch_size": 128, "minibatch_size": 32, "max_new_tokens": 24,
     "max_prompt_tokens": 24, "ignore_eos": True, "learning_rate": 2e-3, "critic_learning_rate": 1e-2,
-    "kl_beta": 0.1, "lora_rank": 32, "lora_layers": 2,
+    "kl_beta": 0.1, "kl_goal": 13.0, "kl_horizon": 2500.0, "lora_rank": 32, "lora_layers": 2,
 }  # fmt: skip
 
 
@@ -123,9 +129,9 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     earlier = options.stages or out
     model = _sft(earlier, for_reward)
     reward = _reward(earlier, model, for_reward)
-    values = dict(ALIGN, seed=options.seed)
+    values = dict(ALIGN_VALUES, seed=options.seed)
     if options.kl_beta is not None:
-        values["kl_beta"] = options.kl_beta
+        values |= {"kl_beta": options.kl_beta, "kl_goal": None}
     run, seconds = _align(values, model, reward, gold, out, openings(for_prompts, 4000))
     return _summary(options, run, seconds, gold)
 
@@ -147,7 +153,7 @@ def _sft(out: Path, rows: list[tuple[str, int]]) -> str:
         print("\n1. Supervised fine-tuning: the language of film reviews")
         rng = random.Random(4)
         texts = [{"text": window(text, 26, rng)} for text, _ in rows for _ in range(3)]
-        settings = SFTSettings(model="glassllm", data="film reviews", seed=0, **SFT)
+        settings = SFTSettings(model="glassllm", data="film reviews", seed=0, **SFT_VALUES)
         with _display(SFT, "examples") as display:
             train_sft(settings, data=texts, run_dir=out / "sft", report=display)
     return str(out / "sft" / "model")
@@ -161,8 +167,8 @@ def _reward(out: Path, model: str, rows: list[tuple[str, int]]) -> str:
         from tightrope.language.settings import RewardSettings
 
         print("\n2. Reward model: a stretch of praise is preferred to one of blame")
-        settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **REWARD)
-        data = pairs(rows, 24, REWARD["max_examples"])
+        settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **REWARD_VALUES)
+        data = pairs(rows, 24, REWARD_VALUES["max_examples"])
         with _display(REWARD, "pairs") as display:
             train_reward(settings, data=data, run_dir=out / "reward", report=display)
     return str(out / "reward")

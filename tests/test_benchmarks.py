@@ -14,6 +14,7 @@ BENCHMARKS = ROOT / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import scaling  # noqa: E402
+import sentiment  # noqa: E402
 import speed  # noqa: E402
 import speed_peers  # noqa: E402
 import speed_report as report  # noqa: E402
@@ -163,6 +164,16 @@ def test_the_page_holds_the_committed_figures(tmp_path: Path):
         copy.write_text(text, encoding="utf-8")
         speed.render(copy, speed.RESULTS, speed.SCALING)
         assert copy.read_text(encoding="utf-8") == text, "run: python benchmarks/speed.py --render"
+
+
+def test_the_page_shows_the_committed_sentiment_runs():
+    if not sentiment.RESULTS.exists():
+        pytest.skip("no results are committed yet")
+    results = json.loads(sentiment.RESULTS.read_text(encoding="utf-8"))
+    page = sentiment.PAGE.read_text(encoding="utf-8")
+    assert report.fill(page, "sentiment", sentiment.text(results)) == page, (
+        "run: python benchmarks/sentiment.py"
+    )
 
 
 def test_committed_results_are_whole_runs():
