@@ -26,17 +26,17 @@ from rlhf_peers import OPENINGS
 from speed import machine
 from speed_runs import HERE, our_environment, plain_environment, run_process
 
-RESULTS = HERE / "results" / "rlhf.json"
+RESULTS = HERE / "results" / "rlhf" / "speed.json"
 TOKENS = 24
 # model -> batch of responses, iterations n1 and n2 of the peer and of ours, layers that one trunk adapts
 MODELS: dict[str, dict[str, Any]] = {
-    "glassllm": {"batch": 64, "peer": (2, 10), "ours": (2, 22), "layers": None},
+    "glassllm": {"batch": 64, "peer": (2, 10), "ours": (2, 22), "layers": 2},
     "smollm2": {"batch": 16, "peer": (1, 3), "ours": (1, 4), "layers": 10},
 }
 LAYOUTS: dict[str, dict[str, Any]] = {
     "full": {"tune": "full", "critic": "separate", "learning_rate": 1e-5},
-    "one trunk, head": {"tune": "lora", "critic": "head"},
-    "one trunk, adapter": {"tune": "lora", "critic": "adapter"},
+    "one trunk, head": {"tune": "lora", "lora_rank": 32, "critic": "head"},
+    "one trunk, adapter": {"tune": "lora", "lora_rank": 32, "critic": "adapter"},
 }
 
 
@@ -80,7 +80,7 @@ def make_reward(folder: str, layers: int | None, out: Path) -> str:
     """A reward model of the same trunk; how good it is does not matter for its speed."""
     from tightrope.language import RewardSettings, train_reward
 
-    rows = [{"prompt": "", "chosen": f"good film {i}", "rejected": f"bad film {i}"} for i in range(32)]
+    rows = [{"chosen": f"good film {i}", "rejected": f"bad film {i}"} for i in range(32)]
     settings = RewardSettings(model=folder, data="-", lora_layers=layers, minibatch_size=16)
     train_reward(settings, data=rows, run_dir=out)
     return str(out)
@@ -139,7 +139,9 @@ def main(words: list[str] | None = None) -> None:
     options = parser.parse_args(words)
     results: dict[str, Any] = {
         "date": datetime.date.today().isoformat(),
-        "command": " ".join(["python benchmarks/rlhf.py", *(w for w in words if not os.path.isabs(w))]),
+        "command": " ".join(
+            ["python benchmarks/rlhf.py", *(Path(w).name if os.path.isabs(w) else w for w in words)]
+        ),
         "machine": machine(),
         "versions": {name: importlib.metadata.version(name) for name in ("torch", "transformers")},
         "rows": [],
@@ -155,6 +157,7 @@ def main(words: list[str] | None = None) -> None:
         for name in options.models:
             reward = make_reward(find_model(name), MODELS[name]["layers"], Path(folder) / name)
             results["rows"] += compare(name, options.peer_python, options.pairs, options.layouts, reward)
+            options.results.parent.mkdir(parents=True, exist_ok=True)
             options.results.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     for row in results["rows"]:
         beside = f", TRL {row['trl']:,.1f}: {row['ratio']['median']:.2f} times" if "trl" in row else ""
