@@ -21,8 +21,8 @@ from tightrope.language.settings import (
     RLHFSettings,
     SFTSettings,
 )
+from tightrope.options import PROGRAM, output
 
-PROGRAM = "tightrope"
 NEEDED = "The language story needs transformers. Install it with: pip install 'tightrope[language]'"
 
 
@@ -120,7 +120,7 @@ def sample(words: list[str]) -> int:
         "--count", type=int, metavar="N", help="How many prompts of the run's data (default 8)."
     )
     group.add_argument("--seed", type=int, metavar="N", help="Seed of sampling (default: the run's + 1).")
-    _output(parser)
+    output(parser)
     given = parser.read(words)
     _require_transformers()
     from tightrope.language.evaluate import sample_run
@@ -145,7 +145,7 @@ def doctor(words: list[str]) -> int:
     parser.add_argument(
         "--model", metavar="M", help="Folder, hub id or packaged name of a causal language model."
     )
-    _output(parser)
+    output(parser)
     given = parser.read(words)
     from tightrope.doctor import examine
 
@@ -207,15 +207,7 @@ def _run_options(parser: Parser) -> None:
         "--run-dir", metavar="FOLDER", help="Where the run lies (default runs/COMMAND-MODEL-TIME)."
     )
     group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
-    _output(parser)
-
-
-def _output(parser: Parser) -> None:
-    group = parser.add_argument_group("output")
-    group.add_argument(
-        "--json", action="store_true", help="Last line of stdout: one JSON object; the rest on stderr."
-    )
-    group.add_argument("--quiet", action="store_true", help="Print the end only.")
+    output(parser)
 
 
 NOT_SETTINGS = ("run_dir", "dry_run", "json", "quiet", "recipe", "gold")

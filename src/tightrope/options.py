@@ -33,13 +33,18 @@ GROUPS = {
 Options = dict[str, Any]
 
 
-def _common(parser: Parser, *, run: bool) -> None:
-    """The options that several commands have."""
+def output(parser: Parser) -> None:
+    """The options about what is printed, which every command has."""
     group = parser.add_argument_group("output")
     group.add_argument(
         "--json", action="store_true", help="Last line of stdout: one JSON object; the rest on stderr."
     )
     group.add_argument("--quiet", action="store_true", help="Print the end only.")
+
+
+def _common(parser: Parser, *, run: bool) -> None:
+    """The options that several commands have."""
+    output(parser)
     group = parser.add_argument_group("code of your own")
     group.add_argument(
         "--env-module",

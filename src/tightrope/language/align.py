@@ -12,17 +12,14 @@ from typing import Any
 
 import torch
 
+from tightrope.language.fitting import Reporter, silent
 from tightrope.language.kl import bias_of
 from tightrope.language.saving import restore_state
 from tightrope.language.settings import NOT_HERE, AlignSettings
-from tightrope.language.trainer import Aligned, Reporter, Trainer
+from tightrope.language.trainer import Aligned, Trainer
 from tightrope.runs.run import Run
 
 __all__ = ["Aligned", "align", "resume_align"]
-
-
-def _silent(event: str, data: dict[str, Any]) -> None:
-    """The reporter that says nothing."""
 
 
 def align(
@@ -32,7 +29,7 @@ def align(
     reward: Any = None,
     gold: Any = None,
     run_dir: str | Path | None = None,
-    report: Reporter = _silent,
+    report: Reporter = silent,
     **values: Any,
 ) -> Aligned:
     """Train a language model against a reward; returns the run.
@@ -81,7 +78,7 @@ def resume_align(
     reward: Any = None,
     gold: Any = None,
     total_episodes: int | None = None,
-    report: Reporter = _silent,
+    report: Reporter = silent,
 ) -> Aligned:
     """Go on from a run's newest checkpoint: adapters, critic, optimiser, kl_beta, prompt order, random
     numbers.

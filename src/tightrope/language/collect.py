@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,12 +21,6 @@ from tightrope.language.settings import AlignSettings
 from tightrope.language.token_stats import token_statistics
 from tightrope.maths import divergence, returns
 from tightrope.maths.statistics import masked_mean, masked_sum, masked_variance
-
-
-class Scorer(Protocol):
-    """Anything that scores whole responses; see `scoring.Judge`."""
-
-    def __call__(self, prompts: Sequence[Prompt], experience: Experience) -> Scores: ...
 
 
 @dataclass
@@ -135,8 +129,7 @@ def _look(roles: Roles, tokens: Tensor, real: Tensor, responses: Responses, rows
             ("ref_logp", theirs.logp),
         )
     }
-    exact_loss = roles.settings.kl in ("exact-split", "exact-loss")
-    kept = torch.where(mask[..., None], reference, 0.0) if exact_loss else None
+    kept = torch.where(mask[..., None], reference, 0.0) if roles.settings.exact_in_loss else None
     return {**found, "values": values, "final_values": final, "lower": lower, "ref_hidden": kept}
 
 

@@ -73,7 +73,7 @@ def job_of(settings: ModelSettings, *, reward: str = "none", extra_tokens: int =
             **common, critic=settings.critic, reward=reward, batch_size=settings.batch_size,
             micro_batch_size=min(rows, settings.batch_size), prompt_tokens=settings.max_prompt_tokens,
             response_tokens=settings.max_new_tokens, extra_tokens=extra_tokens,
-            keeps_exact_kl=settings.kl in ("exact-split", "exact-loss"),
+            keeps_exact_kl=settings.exact_in_loss,
         )  # fmt: skip
     if not isinstance(settings, SupervisedSettings):
         raise ValueError(f"{type(settings).__name__} is no job whose memory is known.")

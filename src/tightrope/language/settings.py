@@ -201,6 +201,11 @@ class AlignSettings(ModelSettings):
         if self.ptx_weight and self.ptx_data is None:
             raise ValueError("ptx_weight needs texts: give ptx_data, or ptx_weight 0.")
 
+    @property
+    def exact_in_loss(self) -> bool:
+        """Whether the exact KL of every state is part of the loss."""
+        return self.kl in ("exact-split", "exact-loss")
+
     def with_values(self, **values: Any) -> Self:
         """The same settings with these changed; names of the update rule's fields are found there."""
         outer = {field.name for field in dataclasses.fields(self)}

@@ -20,6 +20,7 @@ from tightrope.algorithms.optimise import SamplingMismatch, make_optimiser, set_
 from tightrope.language import lora
 from tightrope.language.collect import PromptOrder, describe, gather, rewards_of, to_batch
 from tightrope.language.data import Prompt, read_prompts, read_rows
+from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.models import context_length, find_model
 from tightrope.language.monitor import Monitor
@@ -41,7 +42,6 @@ from tightrope.runs.run import Run
 
 LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
 HELD_OUT_PROMPTS = 64
-Reporter = Callable[[str, dict[str, Any]], None]
 
 
 @dataclass(frozen=True)
@@ -241,9 +241,7 @@ class Trainer:
     def _update(self, batch: Batch, present: Any) -> dict[str, float]:
         """PPO, or the critic alone while it warms up."""
         warming = self.iteration < self.settings.critic_warmup
-        model = PolicyModel(
-            self.roles, exact=self.settings.kl in ("exact-split", "exact-loss"), critic_alone=warming
-        )
+        model = PolicyModel(self.roles, exact=self.settings.exact_in_loss, critic_alone=warming)
         if warming:
             batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
             present = present.unchecked(entropy_weight=0.0, target_kl=None)
