@@ -48,21 +48,26 @@ def _supervised(name: str, kind: type, given: dict[str, Any]) -> int:
         return 0
     if not settings.data:
         raise UsageError(f"What to learn from? Give --data FILE.jsonl: {PROGRAM} {name} --data FILE.jsonl")
+    train, _, columns = _stage(name)
+
+    def run(report: Any) -> dict[str, Any]:
+        return train(settings, run_dir=given.get("run_dir"), report=report)
+
+    return _watched(run, columns, "steps", given)
+
+
+def _stage(name: str) -> tuple[Callable[..., dict[str, Any]], Callable[..., dict[str, Any]], Any]:
+    """How stage one or two is trained, how gone on with, and the columns that show it."""
     _require_transformers()
     from tightrope.language import display
 
-    columns, what = (display.SFT, "examples") if name == "sft" else (display.REWARD, "pairs")
+    if name == "sft":
+        from tightrope.language.sft import resume_sft, train_sft
 
-    def run(report: Any) -> dict[str, Any]:
-        if name == "sft":
-            from tightrope.language.sft import train_sft
+        return train_sft, resume_sft, display.SFT
+    from tightrope.language.reward_model import resume_reward, train_reward
 
-            return train_sft(settings, run_dir=given.get("run_dir"), report=report)
-        from tightrope.language.reward_model import train_reward
-
-        return train_reward(settings, run_dir=given.get("run_dir"), report=report)
-
-    return _watched(run, columns, what, given)
+    return train_reward, resume_reward, display.REWARD
 
 
 def align(words: list[str]) -> int:
@@ -90,7 +95,13 @@ def align(words: list[str]) -> int:
 
 
 def resume(given: dict[str, Any]) -> int:
-    """``tightrope resume RUN`` of an alignment run."""
+    """``tightrope resume RUN`` of a run of sft, reward or align: their settings tell them apart."""
+    from tightrope.runs.run import Run
+
+    settings = Run.open(given["run"]).settings
+    for name, own in (("sft", "on_completions"), ("reward", "demonstrations")):
+        if own in settings:
+            return _resume_supervised(name, given)
     _require_transformers()
     from tightrope.language import display
     from tightrope.language.align import resume_align
@@ -102,6 +113,22 @@ def resume(given: dict[str, Any]) -> int:
         ).summary
 
     return _watched(run, display.ALIGN, "responses", given)
+
+
+def _resume_supervised(name: str, given: dict[str, Any]) -> int:
+    for option in ("total_steps", "reward"):
+        if option in given:
+            flag = option.replace("_", "-")
+            raise UsageError(
+                f"{given['run']} is a run of {name}, which has no --{flag}. Leave it out: its settings say "
+                "how long it learns, and from what."
+            )
+    _, go_on, columns = _stage(name)
+
+    def run(report: Any) -> dict[str, Any]:
+        return go_on(given["run"], data=given.get("data"), report=report)
+
+    return _watched(run, columns, "steps", given)
 
 
 def sample(words: list[str]) -> int:
@@ -253,8 +280,8 @@ def _watched(run: Callable[[Any], dict[str, Any]], columns: Any, what: str, give
         with display:
             summary = run(display)
     except KeyboardInterrupt:
-        where = f" Its last checkpoint lies in {display.run}." if display.run else ""
-        print(f"Stopped at {display.step:,} {what}.{where}", file=sys.stderr)
+        go_on = f" Go on with:\n  {shlex.join([PROGRAM, 'resume', display.run])}" if display.run else ""
+        print(f"Stopped at {display.step:,} {what}.{go_on}", file=sys.stderr)
         return 130
     if as_json:
         _print_json({**summary, "run_dir": display.run})

@@ -151,7 +151,7 @@ def resume_parser() -> Parser:
         "--total-steps",
         type=_at_least_one,
         metavar="N",
-        help="A new end (language: responses); also continues a finished run (default: the run's own).",
+        help="A new end (align: responses); also continues a finished run (default: the run's own).",
     )
     group.add_argument(
         "--reward",
@@ -161,7 +161,7 @@ def resume_parser() -> Parser:
     group.add_argument(
         "--data",
         metavar="FILE",
-        help="align: the prompts again, where they were no file (default: the run's).",
+        help="Language: the data again, where they were no file, or lie elsewhere (default: the run's).",
     )
     _common(parser, run=True)
     return parser

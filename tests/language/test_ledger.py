@@ -172,6 +172,7 @@ def test_jobs_come_from_the_settings_of_the_commands() -> None:
     assert job_of(AlignSettings(batch_size=16)).micro_batch_size == 16
     sft = job_of(SFTSettings(tune="full", micro_batch_size=2))
     assert (sft.tune, sft.reference, sft.critic, sft.micro_batch_size) == ("full", False, "none", 2)
+    assert job_of(SFTSettings(minibatch_size=4, micro_batch_size=8)).micro_batch_size == 4
     pairs = job_of(RewardSettings(micro_batch_size=2))
     assert (pairs.critic, pairs.rows_per_example, pairs.language_head) == ("head", 2, False)
     with pytest.raises(ValueError, match="ModelSettings is no job"):
@@ -186,7 +187,26 @@ def test_supervised_jobs_hold_one_model_and_sample_nothing() -> None:
     pairs = ledger(LLAMA, job_of(RewardSettings(minibatch_size=4)))
     what = "policy: activations of a micro-batch"
     assert entry(pairs, what) == 2 * entry(single, what)
-    assert "logits of one chunk" not in {row.what for row in pairs.rows}
+    names = {row.what for row in pairs.rows}
+    assert "logits of one chunk" not in names and "score head: weights" in names
+
+
+@CONFIGS
+def test_weights_that_are_trained_in_full_stay_float32_beside_their_lowered_copies(config) -> None:
+    """What load() does: --dtype bfloat16 is no saving there, and is not advised."""
+    model = real(config)
+    found = ledger(config, job_of(SFTSettings(tune="full", dtype="bfloat16")))
+    assert entry(found, "policy: weights of the trunk") == size_of(model.parameters())
+    lowered = entry(found, "policy: copies of its weights in bfloat16")
+    assert lowered == size_of(p for p in parts(model).layers.parameters() if p.dim() == 2) / 2
+    with pytest.raises(DoesNotFit) as caught:
+        check(ledger(config, job_of(SFTSettings(tune="full"))), 1000)
+    assert "--micro-batch-size" in str(caught.value) and "--dtype" not in str(caught.value)
+
+
+def test_a_reward_model_does_not_train_the_language_head() -> None:
+    found = ledger(LLAMA, job_of(RewardSettings(tune="full")))
+    assert entry(found, "policy: gradients") == size_of(parts(real(LLAMA)).base.parameters())
 
 
 def test_a_job_that_fits_passes_and_one_that_does_not_is_told_what_helps() -> None:

@@ -320,7 +320,7 @@ def test_the_run_folder_tells_what_happened(tmp_path, folder):
     assert held <= set(rows[-1]) and not held & set(rows[0])
     assert summary["held_out_pairs"] == summary["pairs"] == 40
     assert rows[-1]["reward/held_out_accuracy"] == summary["final"]["reward/held_out_accuracy"]
-    assert [kind for kind, _ in events] == ["start", *["update"] * 5, "finish"]
+    assert [kind for kind, _ in events] == ["line", "start", *["update"] * 5, "finish"]
 
 
 def test_same_seed_same_bits_other_seed_others(tmp_path, folder):

@@ -188,7 +188,7 @@ def test_it_learns_facts_and_where_they_end(tmp_path, make, tune):
     losses = [row["sft/loss"] for row in Run.open(tmp_path / "run").read_metrics() if "sft/loss" in row]
     assert len(losses) == 80 and losses[-1] < 0.1 < losses[0] / 10
     assert summary["tokens"] == 3 * len(FACTS)
-    assert [kind for kind, _ in events] == ["start", *["update"] * 80, "finish"]
+    assert [kind for kind, _ in events] == ["line", "start", *["update"] * 80, "finish"]
 
 
 def test_lora_leaves_the_trunk_alone_and_the_merged_model_is_the_adapted_one(tmp_path, folder):
@@ -336,5 +336,5 @@ def test_long_rows_are_reported(tmp_path, folder):
     lines = []
     settings = settings_of(folder, max_tokens=5)
     train_sft(settings, data=FACTS, run_dir=tmp_path / "run", report=lambda *event: lines.append(event))
-    said = [data["text"] for kind, data in lines if kind == "line"]
+    said = [data["text"] for kind, data in lines if data.get("warning")]
     assert said == ["warning: 8 of 8 rows have more than max_tokens 5 tokens and were cut."]

@@ -1,16 +1,19 @@
-"""The loop that supervised fine-tuning and reward modelling share, and what stands before it: model, data.
+"""The loop that supervised fine-tuning and reward modelling share, and what stands before it: memory, model,
+data.
 
-minibatch -> micro-batches, whose gradients add up -> Adam -> record; held-out examples after every epoch
+minibatch -> micro-batches, whose gradients add up -> Adam -> record -> save; held-out examples after an epoch
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -21,6 +24,7 @@ from tightrope.algorithms.optimise import Adam, Brake, Meter
 from tightrope.algorithms.settings import scheduled
 from tightrope.language import lora
 from tightrope.language.data import Row, read_rows
+from tightrope.language.ledger import available_memory, check, job_of, ledger
 from tightrope.language.models import (
     context_length,
     eos_ids,
@@ -29,6 +33,7 @@ from tightrope.language.models import (
     load_tokenizer,
     without_dropout,
 )
+from tightrope.language.saving import Progress, load_progress, put_back, save_progress, tensors_of
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.run import Run
 
@@ -55,6 +60,35 @@ class Loaded(NamedTuple):
     source: str
     eos: tuple[int, ...]
     adapter: str | None
+
+
+@contextlib.contextmanager
+def prepared(
+    settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None, report: Reporter
+) -> Iterator[Loaded]:
+    """The model, ready to train inside: its memory told and found to fit before it is loaded, its adapter on,
+    the settings' threads at work.
+    """
+    with threads(settings.threads):
+        present_memory(settings, given, report)
+        loaded = load(settings, adapter, given)
+        with lora.using(loaded.model, loaded.adapter):
+            yield loaded
+
+
+def present_memory(settings: SupervisedSettings, given: tuple[Any, Any] | None, report: Reporter) -> None:
+    """Say what the job will take, and refuse it with advice when it cannot fit: from the config alone.
+
+    The weights of a model that is given, where they lie on the device already, need no more room.
+    """
+    from transformers import AutoConfig
+
+    place = torch.device(settings.device)
+    weights = [] if given is None else [p for p in given[0].parameters() if p.device.type == place.type]
+    config = AutoConfig.from_pretrained(find_model(settings.model)) if given is None else given[0].config
+    found, available = ledger(config, job_of(settings)), available_memory(place)
+    report("line", {"text": found.text()})
+    check(found, None if available is None else available + sum(p.nbytes for p in weights))
 
 
 def load(settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None = None) -> Loaded:
@@ -170,40 +204,66 @@ def fit(
     settings: SupervisedSettings,
     run: Run,
     report: Reporter,
+    lines: Sequence[str],
 ) -> dict[str, float]:
-    """Train; returns the newest value of every metric. A step is one minibatch.
+    """Train, from the newest checkpoint of the run where it has one; returns the newest value of every
+    metric. A step is one minibatch; ``lines`` are reported at the start.
 
-    Raises NonFiniteError before a step with a NaN or an infinity in its gradient.
+    Raises NonFiniteError before a step with a NaN or an infinity in its gradient, ValueError for a checkpoint
+    of other data.
     """
     group = {"params": list(parameters), "lr": settings.learning_rate}
     optimiser = Adam([group], eps=1e-8, fused=True)
-    brake, rng = Brake(parameters[0].device), np.random.default_rng(settings.seed)
-    items, size = objective.items, settings.minibatch_size
-    each = math.ceil(len(items) / size)
-    total, seconds, seen = each * settings.num_epochs, 0.0, 0
-    newest = objective.evaluate()
-    if newest:
-        run.record(0, 0.0, newest)
-    for step in range(total):
-        if step % each == 0:
-            order = rng.permutation(len(items))
+    brake, items = Brake(parameters[0].device), objective.items
+    each = math.ceil(len(items) / settings.minibatch_size)
+    total = each * settings.num_epochs
+    now, saved = load_progress(run, Progress(objective.name, len(items)))
+    if saved is not None:
+        put_back(saved, parameters, optimiser)
+    run.rewind(now.step or -1)  # what stands at step 0 is recorded again
+    run.update_settings(dataclasses.asdict(settings))
+    facts = {"run_dir": str(run.path), "step": now.step, "total_steps": total}
+    report("start", {"settings": run.settings, "lines": list(lines), **facts})
+    if not now.step and (first := objective.evaluate()):
+        now.newest |= first
+        run.record(0, 0.0, first)
+    for minibatch in islice(minibatches(items, settings), now.step, None):
         clock = time.perf_counter()
-        minibatch = [items[i] for i in order[step % each * size :][:size]]
-        rate = scheduled(settings.learning_rate, settings.learning_rate_schedule, step / total)
+        rate = scheduled(settings.learning_rate, settings.learning_rate_schedule, now.step / total)
         optimiser.param_groups[0]["lr"] = rate
         metrics = take_step(objective, minibatch, optimiser, brake, settings)
         metrics[f"{objective.steps}/learning_rate"] = rate or 0.0
-        seen += sum(objective.count(item) for item in minibatch)
+        now.step += 1
+        now.seen += sum(objective.count(item) for item in minibatch)
         if objective.seen is not None:
-            metrics[objective.seen] = float(seen)
-        seconds += time.perf_counter() - clock
-        if (step + 1) % each == 0:
+            metrics[objective.seen] = float(now.seen)
+        now.seconds += time.perf_counter() - clock
+        if now.step % each == 0:
             metrics |= objective.evaluate()
-        metrics["time/seconds"] = seconds
-        run.record(step + 1, seconds, metrics)
-        report("update", {"step": step + 1, "total_steps": total, "metrics": metrics, "seconds": seconds})
-        newest |= metrics
-    return newest
+        metrics["time/seconds"] = now.seconds
+        now.newest |= metrics
+        run.record(now.step, now.seconds, metrics)
+        event = {"step": now.step, "metrics": metrics, "seconds": now.seconds}
+        report("update", {**event, "total_steps": total})
+        if now.step == total or reaches(now.step, total, settings.checkpoint_every):
+            save_progress(run, now, tensors_of(parameters, optimiser))
+    return now.newest
+
+
+def minibatches(items: Sequence[Item], settings: SupervisedSettings) -> Iterator[list[Item]]:
+    """Those of every step, in order: a function of the seed alone, wherever a run is stopped."""
+    rng, size = np.random.default_rng(settings.seed), settings.minibatch_size
+    for _ in range(settings.num_epochs):
+        order = rng.permutation(len(items))
+        for start in range(0, len(items), size):
+            yield [items[i] for i in order[start : start + size]]
+
+
+def reaches(step: int, total: int, fraction: float | None) -> bool:
+    """Whether this step comes to a point of the grid ``fraction``, 2 ``fraction``, ... of the run."""
+    if fraction is None:
+        return False
+    return int(step / total / fraction + 1e-9) > int((step - 1) / total / fraction + 1e-9)
 
 
 def take_step(
@@ -236,33 +296,3 @@ def micro_batches(
     ordered = sorted(items, key=length)
     for start in range(0, len(ordered), size or max(1, len(ordered))):
         yield ordered[start : start + (size or len(ordered))]
-
-
-def announcement(
-    settings: SupervisedSettings, run: Run, loaded: Loaded, parameters: Sequence[nn.Parameter], data: str
-) -> dict[str, Any]:
-    """What is reported when training starts: the settings, the run folder, and two lines in words."""
-    trained = sum(parameter.numel() for parameter in parameters)
-    total = sum(parameter.numel() for parameter in loaded.model.parameters())
-    lines = [
-        f"model: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained",
-        f"data: {data}",
-    ]
-    return {"settings": run.settings, "run_dir": str(run.path), "lines": lines, "step": 0}
-
-
-def finish(
-    settings: SupervisedSettings, run: Run, report: Reporter, final: dict[str, float], **more: Any
-) -> dict[str, Any]:
-    """Write summary.json and report it; returns it."""
-    summary = {
-        "model": settings.model,
-        "seed": settings.seed,
-        **more,
-        "wall_seconds": final.get("time/seconds", 0.0),
-        "final": {name: value for name, value in final.items() if name != "time/seconds"},
-        "run_dir": str(run.path),
-    }
-    run.finish(summary)
-    report("finish", summary)
-    return summary

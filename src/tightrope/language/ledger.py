@@ -40,7 +40,8 @@ class Job:
     ``dtype`` is that of whole models, trained or frozen; adapters and heads are float32. ``critic``: none,
     head, adapter, separate; ``reward``: none (a function), adapter, separate. With ``response_tokens`` 0
     nothing is sampled. ``rows_per_example``: 2 where pairs are compared. ``language_head`` False: no logits.
-    ``extra_tokens``: tokens of a pretraining loss per micro-batch.
+    ``extra_tokens``: tokens of a pretraining loss per micro-batch. ``keeps_float32``: where every weight is
+    trained, the weights stay float32 and ``dtype`` lowers copies of them for the arithmetic.
     """
 
     tune: str = "lora"
@@ -59,6 +60,12 @@ class Job:
     keeps_exact_kl: bool = False
     language_head: bool = True
     extra_tokens: int = 0
+    keeps_float32: bool = False
+
+    @property
+    def lowered(self) -> bool:
+        """Whether a forward pass makes copies of float32 weights in a lower precision."""
+        return self.keeps_float32 and self.tune == "full" and self.dtype != "float32"
 
 
 def job_of(settings: ModelSettings, *, reward: str = "none", extra_tokens: int = 0) -> Job:
@@ -78,10 +85,11 @@ def job_of(settings: ModelSettings, *, reward: str = "none", extra_tokens: int =
     if not isinstance(settings, SupervisedSettings):
         raise ValueError(f"{type(settings).__name__} is no job whose memory is known.")
     pairs = isinstance(settings, RewardSettings)
-    rows = settings.micro_batch_size or settings.minibatch_size
+    rows = min(settings.micro_batch_size or settings.minibatch_size, settings.minibatch_size)
     return Job(
         **common, reference=False, critic="head" if pairs else "none", language_head=not pairs,
         micro_batch_size=rows, rows_per_example=2 if pairs else 1, prompt_tokens=settings.max_tokens,
+        keeps_float32=True,
     )  # fmt: skip
 
 
@@ -135,7 +143,7 @@ def ledger(config: Any, job: Job) -> Ledger:
 
     Allocates nothing large. ValueError when the architecture is not known, or has too few layers.
     """
-    shapes = shapes_of(config, job.dtype)
+    shapes = shapes_of(config, "float32" if job.lowered else job.dtype)
     count = len(shapes.linears)
     adapted = count if job.lora_layers is None else job.lora_layers
     if job.tune == "lora" and adapted > count:
@@ -155,11 +163,13 @@ def _roles(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
         yield Row("policy: weights of its adapter", adapter)
     elif job.reference:
         yield Row("reference: a frozen copy", whole)
-    yield from _trained("policy", whole if job.tune == "full" else adapter)
+    learnt = whole if job.language_head else shapes.item * shapes.base
+    yield from _trained("policy", learnt if job.tune == "full" else adapter)
     if job.critic != "none":
         own = {"head": 0, "adapter": adapter, "separate": shapes.item * shapes.base}[job.critic]
-        yield Row("critic: weights", head + (whole if job.critic == "separate" else own))
-        yield from _trained("critic", own + head)
+        role = "critic" if job.language_head else "score head"
+        yield Row(f"{role}: weights", head + (whole if job.critic == "separate" else own))
+        yield from _trained(role, own + head)
     if job.reward != "none":
         yield Row("reward model: weights", head + (whole if job.reward == "separate" else adapter))
 
@@ -189,6 +199,9 @@ def _update(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
         own = 1.0 if job.critic == "separate" else share
         yield Row("critic: activations of a micro-batch", activations(tokens, own), "update")
     yield Row("one layer at work", tokens * shapes.saved // count, "update")
+    if job.lowered:
+        numbers = sum(a * b for layer in shapes.linears for a, b in layer)
+        yield Row(f"policy: copies of its weights in {job.dtype}", 2 * numbers, "update")
     if job.language_head:
         chosen = rows * job.response_tokens or tokens
         logits = min(chosen * shapes.vocabulary, max(CHUNK, shapes.vocabulary))

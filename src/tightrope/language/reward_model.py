@@ -8,7 +8,6 @@ saved as the head, and shift = mean / deviation stands in config.json: the head 
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Sequence
@@ -25,15 +24,12 @@ from tightrope.language.fitting import (
     Loaded,
     Objective,
     Reporter,
-    announcement,
-    finish,
     fit,
     hold_out,
-    load,
     micro_batches,
     precision,
+    prepared,
     silent,
-    threads,
     training_rows,
     warner,
 )
@@ -41,7 +37,7 @@ from tightrope.language.models import load_tokenizer, parts, without_dropout
 from tightrope.language.reward_saving import SHIFT, reward_skeleton, save_reward
 from tightrope.language.sampling import positions
 from tightrope.language.settings import RewardSettings
-from tightrope.runs.run import Run
+from tightrope.language.supervised import announcement, finish, opened, recorded, reopened
 
 DEMONSTRATIONS = 1024  # texts on which scores are normalised, at most
 BINS = 10
@@ -202,21 +198,38 @@ def train_reward(
     whose trunk is trained in place. The run folder holds settings.json, metrics.jsonl, summary.json (with the
     calibration table) and ``model``, which AutoModelForSequenceClassification.from_pretrained loads; tuned by
     LoRA also ``adapter``, which PEFT loads and alignment puts on its own trunk.
-    Raises ValueError for data or settings that cannot work, before anything is trained.
+    Raises ValueError for data or settings that cannot work, before anything is trained, and DoesNotFit, which
+    is one, for too little memory, before the model is loaded.
     """
-    with threads(settings.threads):
-        loaded = load(settings, "reward", model)
-        with lora.using(loaded.model, loaded.adapter):
-            return _train(settings, loaded, (data, validation, demonstrations), report, run_dir)
+    given = {"data": data, "validation": validation, "demonstrations": demonstrations}
+    settings = recorded(settings, **given, model=model and model[0])
+    with prepared(settings, "reward", model, report) as loaded:
+        return _train(settings, loaded, given, report, run_dir)
+
+
+def resume_reward(
+    run_dir: str | Path,
+    *,
+    data: Any = None,
+    validation: Any = None,
+    demonstrations: Any = None,
+    model: tuple[Any, Any] | None = None,
+    report: Reporter = silent,
+) -> dict[str, Any]:
+    """Go on with a run of `train_reward`, as `resume_sft` does with one of `train_sft`."""
+    given = {"data": data, "validation": validation, "demonstrations": demonstrations}
+    run, settings = reopened(RewardSettings, run_dir, **given, model=model and model[0])
+    with prepared(settings, "reward", model, report) as loaded:
+        return _train(settings, loaded, given, report, run)
 
 
 def _train(
-    settings: RewardSettings, loaded: Loaded, sources: tuple[Any, Any, Any], report: Reporter, run_dir: Any
+    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], report: Reporter, place: Any
 ) -> dict[str, Any]:
     base, size = parts(loaded.model).base, settings.micro_batch_size or settings.minibatch_size
     head = make_head(loaded.model.config.hidden_size, settings.seed).to(settings.device)
     model, skeleton = RewardModel(base, head, 0.0, loaded.tokenizer), reward_skeleton(loaded)
-    pairs, held, texts = _data(settings, loaded, *sources, report)
+    pairs, held, texts = _data(settings, loaded, report, **given)
 
     def loss(items: Sequence[Pair]) -> tuple[Tensor, dict[str, Tensor]]:
         with precision(settings):
@@ -241,11 +254,10 @@ def _train(
         own = lora.adapter_parameters(loaded.model, loaded.adapter)
     parameters = [*own, *head.parameters()]
     objective = Objective("reward", "train", pairs, loss, lambda pair: 1, longest, evaluate)
-    name = f"reward-{Path(settings.model).name}-{settings.seed}"
-    with Run.create(run_dir, dataclasses.asdict(settings), name) as run:
-        words = f"{len(pairs)} pairs; {len(held)} held out"
-        report("start", announcement(settings, run, loaded, parameters, words))
-        final = fit(objective, parameters, settings, run, report)
+    words = f"{len(pairs)} pairs; {len(held)} held out"
+    with opened(place, settings, "reward") as run:
+        lines = announcement(settings, loaded, parameters, words)
+        final = fit(objective, parameters, settings, run, report, lines)
         table = calibration(held_out())[1] if held else []
         with precision(settings):
             mean, deviation = normalise(model, texts, size)
@@ -258,10 +270,10 @@ def _train(
 def _data(
     settings: RewardSettings,
     loaded: Loaded,
+    report: Reporter,
     data: Any,
     validation: Any,
     demonstrations: Any,
-    report: Reporter,
 ) -> tuple[list[Pair], list[Pair], list[tuple[int, ...]]]:
     """Pairs to train on, pairs held out (whole prompts, where there are many), and texts to normalise on."""
     reading: dict[str, Any] = {"eos": loaded.eos, "max_tokens": settings.max_tokens, "notify": warner(report)}

@@ -1,14 +1,18 @@
-"""What an alignment run leaves: the model that plain transformers loads, the adapter that PEFT loads, and the
-state from which the run goes on.
+"""What a run leaves: the model that plain transformers loads, the adapter that PEFT loads, and the state from
+which the run goes on.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
 from tightrope.language import lora
@@ -39,14 +43,26 @@ def write_model(model: Any, tokenizer: Any, folder: Path, adapter: str | None) -
     tokenizer.save_pretrained(folder)
 
 
-def trained_tensors(roles: Roles) -> dict[str, Tensor]:
-    """Every tensor that training changes, in the order of the optimiser."""
-    return {f"{index:05d}": parameter for index, parameter in enumerate(roles.parameters())}
+Tensors = dict[str, dict[str, Tensor]]
+
+
+def tensors_of(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> Tensors:
+    """Every tensor that training changes, in the order of ``parameters``, and the optimiser's moments."""
+    trained = {f"{index:05d}": parameter.data for index, parameter in enumerate(parameters)}
+    return {"trained": trained, "optimiser": optimiser_tensors(optimiser)}
+
+
+@torch.no_grad()
+def put_back(tensors: Tensors, parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> None:
+    """Copy what `tensors_of` gave into the same parameters and their optimiser."""
+    for index, parameter in enumerate(parameters):
+        parameter.copy_(tensors["trained"][f"{index:05d}"])
+    restore_optimiser(optimiser, tensors["optimiser"])
 
 
 def save_state(trainer: Trainer, run: Run) -> Path:
     """A checkpoint at the present episode."""
-    tensors = {"trained": trained_tensors(trainer.roles), "optimiser": optimiser_tensors(trainer.optimiser)}
+    tensors = tensors_of(trainer.roles.parameters(), trainer.optimiser)
     state: dict[str, Any] = {
         "story": "align",
         "episodes": trainer.episodes,
@@ -66,10 +82,7 @@ def restore_state(trainer: Trainer, folder: Path) -> None:
     tensors, state = checkpoint.load(folder)
     if state.get("story") != "align":
         raise ValueError(f"{folder} is no checkpoint of an alignment run.")
-    with torch.no_grad():
-        for key, parameter in trained_tensors(trainer.roles).items():
-            parameter.copy_(tensors["trained"][key])
-    restore_optimiser(trainer.optimiser, tensors["optimiser"])
+    put_back(tensors, trainer.roles.parameters(), trainer.optimiser)
     trainer.episodes, trainer.iteration = int(state["episodes"]), int(state["iteration"])
     trainer.kl_beta = float(state["kl_beta"])
     trainer.order.position = int(state["prompt_position"])
@@ -77,3 +90,43 @@ def restore_state(trainer: Trainer, folder: Path) -> None:
     trainer.monitor.restore(state["monitor"])
     if trainer.pretraining is not None:
         trainer.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
+
+
+@dataclass
+class Progress:
+    """Where supervised training stands: ``step`` optimiser steps of ``story`` (sft, reward) on ``items``
+    examples, ``seen`` terms learnt from, ``seconds``, and the newest value of every metric.
+    """
+
+    story: str
+    items: int
+    step: int = 0
+    seen: int = 0
+    seconds: float = 0.0
+    newest: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+def save_progress(run: Run, progress: Progress, tensors: Tensors) -> Path:
+    """A checkpoint of supervised training at its present step."""
+    return checkpoint.save(run.checkpoint_folder(progress.step), tensors, dataclasses.asdict(progress))
+
+
+def load_progress(run: Run, fresh: Progress) -> tuple[Progress, Tensors | None]:
+    """The newest checkpoint of a run; ``fresh`` and None where the run has saved nothing yet.
+
+    ValueError when it is another story's, or stands in other data than ``fresh`` does.
+    """
+    if not any(run.checkpoints.glob("step-*")):
+        return fresh, None
+    folder = run.newest_checkpoint()
+    tensors, state = checkpoint.load(folder)
+    if state.get("story") != fresh.story:
+        raise ValueError(f"{folder} is a checkpoint of {state.get('story')!r}, expected {fresh.story!r}.")
+    found = Progress(**state)
+    if found.items != fresh.items:
+        raise ValueError(
+            f"{run.path} was learning from {found.items} examples, the data now have {fresh.items}. Give the "
+            "data that the run began with, or begin a new run."
+        )
+    found.newest = {name: math.nan if x is None else x for name, x in found.newest.items()}
+    return found, tensors

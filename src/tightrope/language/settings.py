@@ -15,7 +15,7 @@ NOT_HERE = ("kl_beta", "kl_adapt", "recompute_advantages")
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings:
-    """Which model, which of its weights are trained, and where."""
+    """Which model, which of its weights are trained, where, and how often they are saved."""
 
     model: str = setting("glassllm", "Folder or hub id of the model, or a packaged one: glassllm, smollm2.")
     tune: Tune = setting(
@@ -34,6 +34,9 @@ class ModelSettings:
     threads: int | None = setting(None, "CPU threads of torch; none: every core.", at_least=1)
     gradient_checkpointing: bool = setting(
         False, "Compute activations again in the backward pass: less memory, a third more time."
+    )
+    checkpoint_every: float | None = setting(
+        0.25, "Fraction of the run between checkpoints; none: only the last.", above=0, at_most=1
     )
 
     def __post_init__(self) -> None:
@@ -162,9 +165,6 @@ class AlignSettings(ModelSettings):
     )
     evaluate_every: float | None = setting(
         0.05, "Fraction of the run between gold scores on held-out prompts.", above=0, at_most=1
-    )
-    checkpoint_every: float | None = setting(
-        0.25, "Fraction of the run between checkpoints; none: only the last.", above=0, at_most=1
     )
 
     def __post_init__(self) -> None:

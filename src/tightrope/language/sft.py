@@ -5,7 +5,6 @@ L = - sum over learnt tokens of log p(token | what stands before it) / their num
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,12 @@ from tightrope.language.fitting import (
     Loaded,
     Objective,
     Reporter,
-    announcement,
-    finish,
     fit,
     hold_out,
-    load,
     micro_batches,
     precision,
+    prepared,
     silent,
-    threads,
     training_rows,
     warner,
 )
@@ -35,8 +31,8 @@ from tightrope.language.models import parts
 from tightrope.language.packing import Packed, attention_of, collate, pack, row_of
 from tightrope.language.saving import write_model
 from tightrope.language.settings import SFTSettings
+from tightrope.language.supervised import announcement, finish, opened, recorded, reopened
 from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.runs.run import Run
 
 
 def hidden_states(model: Any, rows: Packed) -> Tensor:
@@ -87,16 +83,35 @@ def train_sft(
     settings.json, metrics.jsonl, summary.json and ``model``, which AutoModelForCausalLM.from_pretrained
     loads, with tokenizer and chat template; tuned by LoRA the adapter is folded into it, and lies in
     ``adapter`` for PEFT as well. Raises ValueError for data or settings that cannot work, before anything is
-    trained.
+    trained, and DoesNotFit, which is one, for too little memory, before the model is loaded.
     """
-    with threads(settings.threads):
-        loaded = load(settings, "sft", model)
-        with lora.using(loaded.model, loaded.adapter):
-            return _train(settings, loaded, data, validation, report, run_dir)
+    settings = recorded(settings, data=data, validation=validation, model=model and model[0])
+    with prepared(settings, "sft", model, report) as loaded:
+        return _train(settings, loaded, data, validation, report, run_dir)
+
+
+def resume_sft(
+    run_dir: str | Path,
+    *,
+    data: Any = None,
+    validation: Any = None,
+    model: tuple[Any, Any] | None = None,
+    report: Reporter = silent,
+) -> dict[str, Any]:
+    """Go on from a run's newest checkpoint, or from its beginning where there is none yet; the end is that of
+    a run without a break, bit for bit.
+
+    What `train_sft` was given as an object is given again, the model as it was before training. Files are
+    read again. ValueError names what is missing.
+    """
+    given = {"data": data, "validation": validation, "model": model and model[0]}
+    run, settings = reopened(SFTSettings, run_dir, **given)
+    with prepared(settings, "sft", model, report) as loaded:
+        return _train(settings, loaded, data, validation, report, run)
 
 
 def _train(
-    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, report: Reporter, run_dir: Any
+    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, report: Reporter, place: Any
 ) -> dict[str, Any]:
     model, size = loaded.model, settings.micro_batch_size or settings.minibatch_size
     rows, held = _rows(settings, loaded, data, validation, report)
@@ -114,11 +129,10 @@ def _train(
         parameters = lora.adapter_parameters(model, loaded.adapter)
     learnt = sum(_learnt(row) for row in rows)
     objective = Objective("sft", "sft", rows, loss, _learnt, len, evaluate, seen="sft/tokens")
-    name = f"sft-{Path(settings.model).name}-{settings.seed}"
-    with Run.create(run_dir, dataclasses.asdict(settings), name) as run:
-        words = f"{len(rows)} rows, {learnt:,} tokens to learn; {len(held)} rows held out"
-        report("start", announcement(settings, run, loaded, parameters, words))
-        final = fit(objective, parameters, settings, run, report)
+    words = f"{len(rows)} rows, {learnt:,} tokens to learn; {len(held)} rows held out"
+    with opened(place, settings, "sft") as run:
+        lines = announcement(settings, loaded, parameters, words)
+        final = fit(objective, parameters, settings, run, report, lines)
         write_model(model, loaded.tokenizer, run.path / "model", loaded.adapter)
         if loaded.adapter is not None:
             lora.save_adapter(model, loaded.adapter, run.path / "adapter", base_model=loaded.source)
