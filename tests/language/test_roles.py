@@ -9,11 +9,12 @@ from language.tiny import saved
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.optimise import make_optimiser
-from tightrope.language import lora
+from tightrope.language import lora, policy_model
 from tightrope.language.collect import gather, rewards_of, to_batch
 from tightrope.language.data import Prompt
+from tightrope.language.policy_model import PolicyModel, length_groups, trimmed
 from tightrope.language.rewards import Scores
-from tightrope.language.roles import PolicyModel, make_roles, trimmed
+from tightrope.language.roles import make_roles
 from tightrope.language.settings import AlignSettings, RLHFSettings
 
 PROMPTS = [Prompt((5, 6, 7), "bcd", {}), Prompt((8, 9), "ef", {}), Prompt((10, 11, 12, 13, 14), "ghijk", {})]
@@ -165,6 +166,32 @@ def poison(batch, name):
 def test_trimmed_keeps_every_real_column():
     real = torch.tensor([[0, 0, 1, 1, 1, 0, 0], [0, 1, 1, 1, 1, 1, 0]]).bool()
     assert trimmed(real, real[:, 4:]) == (1, 6)
+
+
+def test_rows_of_different_lengths_go_in_groups_of_like_ones():
+    prompts, responses = torch.tensor([3, 40, 3, 40, 3, 40, 3, 40] * 8), torch.tensor([2, 20] * 32)
+    columns = torch.arange(60)
+    real = (columns >= 40 - prompts[:, None]) & (columns < 40 + responses[:, None])
+    groups = length_groups(real, real[:, 40:])
+    assert sorted(torch.cat(groups).tolist()) == list(range(64))
+    assert len(groups) == 2 and all(prompts[rows].unique().numel() == 1 for rows in groups)
+    assert len(length_groups(real[:1].expand(64, -1), real[:1, 40:].expand(64, -1))) == 1
+
+
+def test_groups_change_neither_statistics_nor_gradients(folder, monkeypatch):
+    roles, _, _, batch = experienced(settings(folder, critic="separate"))
+    found = []
+    for most, overhead in ((1, 64), (4, 0)):
+        monkeypatch.setattr(policy_model, "MOST_GROUPS", most)
+        monkeypatch.setattr(policy_model, "PASS", overhead)
+        groups = len(length_groups(batch.inputs["real"], batch.mask))
+        assert (groups > 1) == (most > 1)
+        now = PolicyModel(roles)(batch)
+        weights = torch.linspace(-1, 1, now.logp.numel()).view_as(now.logp)
+        gradients = torch.autograd.grad((weights * (now.logp + now.values)).sum(), roles.parameters())
+        found.append([x.detach() for x in (now.logp, now.values, now.entropy, *gradients)])
+    for one, other in zip(*found, strict=True):
+        assert float((one - other).norm()) <= 1e-5 * float(one.norm()) + 1e-6
 
 
 def test_the_score_lands_on_the_last_real_token_and_advantages_are_brute_force(folder):

@@ -43,13 +43,13 @@ def test_values_and_gradients(monkeypatch, bias, chunk, sampling, top):
         tokens = support[torch.arange(N), torch.arange(N) % top]
     weights = torch.randn(3, N)
     found = token_statistics(hidden, head, tokens, sampling, support=support, reference=reference)
-    sum((w * x).sum() for w, x in zip(weights, found, strict=True)).backward()
+    sum((w * x).sum() for w, x in zip(weights, found[:3], strict=True)).backward()
     got = [hidden.grad.clone(), *(p.grad.clone() for p in head.parameters())]
     hidden.grad = None
     head.zero_grad()
     wanted = plainly(head, hidden, reference, tokens, sampling, support)
     sum((w * x).sum() for w, x in zip(weights, wanted, strict=True)).backward()
-    for a, b in zip(found, wanted, strict=True):
+    for a, b in zip(found[:3], wanted, strict=True):
         torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=1e-5)
     # the reference shares the head: its own gradient there is not asked for
     torch.testing.assert_close(got[0], hidden.grad, rtol=1e-3, atol=1e-5)
@@ -62,6 +62,34 @@ def test_the_head_gets_its_gradient_when_it_is_trained():
     head.zero_grad()
     head(hidden).log_softmax(1).gather(1, tokens[:, None]).sum().backward()
     torch.testing.assert_close(got, (head.weight.grad, head.bias.grad), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("top", [0, 5])
+def test_a_gradient_computed_ahead_is_the_one_computed_later(monkeypatch, top):
+    monkeypatch.setattr(token_stats, "CHUNK", 3 * V)
+    head, hidden, reference, tokens = numbers(True, torch.float32)
+    head.requires_grad_(False)
+    sampling, support = Sampling(0.8, forbidden=(0, 1)), None
+    if top:
+        support = head(hidden)[:, 2:].topk(top, 1).indices + 2
+        tokens = support[torch.arange(N), torch.arange(N) % top]
+    weights, found = torch.randn(3, N), []
+    for ahead in (False, True):
+        for used in ((0,), (0, 1, 2)):  # with entropy or KL in the loss it must give way
+            out = token_statistics(
+                hidden, head, tokens, sampling, support=support, reference=reference, ahead=ahead
+            )
+            loss = sum((weights[i] * out[i]).sum() for i in used)
+            found.append(torch.autograd.grad(loss, hidden)[0])
+    torch.testing.assert_close(found[:2], found[2:], rtol=1e-5, atol=1e-6)
+    assert not torch.allclose(found[0], found[1])
+
+
+def test_the_references_log_probability_is_its_own():
+    head, hidden, reference, tokens = numbers(True, torch.float32)
+    one = token_statistics(hidden, head, tokens, Sampling(0.7), reference=reference)
+    other = token_statistics(reference, head, tokens, Sampling(0.7))
+    assert torch.equal(one.reference_logp, other.logp) and not one.reference_logp.requires_grad
 
 
 def test_temperature_divides_in_sampling_and_training_alike():

@@ -109,10 +109,10 @@ def _look(roles: Roles, tokens: Tensor, real: Tensor, responses: Responses, rows
     policy = roles.policy_hidden(tokens, real, lower)
     reference = roles.reference_hidden(tokens, real, lower)[:, first:-1]
     support = None if responses.support is None else responses.support[rows][mask]
-    chosen, head = responses.tokens[rows][mask], roles.head_of_reference()
-    more: dict[str, Any] = {"support": support, "reference": reference[mask], "reference_head": head}
-    own = token_statistics(policy[:, first:-1][mask], roles.trunk.parts.head, chosen, roles.sampling, **more)
-    theirs = token_statistics(reference[mask], head, chosen, roles.sampling, support=support)
+    own = token_statistics(
+        policy[:, first:-1][mask], roles.trunk.parts.head, responses.tokens[rows][mask], roles.sampling,
+        support=support, reference=reference[mask], reference_head=roles.head_of_reference(),
+    )  # fmt: skip
     zeros = torch.zeros(mask.shape, device=tokens.device)
     values, final = zeros, zeros[:, 0]
     if roles.critic_head is not None:
@@ -126,7 +126,7 @@ def _look(roles: Roles, tokens: Tensor, real: Tensor, responses: Responses, rows
             ("logp", own.logp),
             ("entropy", own.entropy),
             ("exact", own.kl),
-            ("ref_logp", theirs.logp),
+            ("ref_logp", own.reference_logp),
         )
     }
     kept = torch.where(mask[..., None], reference, 0.0) if roles.settings.exact_in_loss else None

@@ -68,10 +68,9 @@ class Adapted(nn.Module):
             return self._linear(x, self._folded[name])
         if self._narrow(name):
             return self._linear(x, self.merged(name))
-        y = self.base(x)
-        low = x.reshape(-1, x.shape[-1]) @ self.down[name].to(x.dtype).T
-        up = self.up[name].to(x.dtype).T
-        return torch.addmm(y.reshape(-1, y.shape[-1]), low, up, alpha=self._scale[name]).view(y.shape)
+        flat = x.reshape(-1, x.shape[-1])
+        low, up = flat @ self.down[name].to(x.dtype).T, self.up[name].to(x.dtype).T
+        return self.base(flat).addmm_(low, up, alpha=self._scale[name]).view(*x.shape[:-1], -1)
 
     def _narrow(self, name: str) -> bool:
         """Whether W + BA as one matrix costs less than x A and (x A) B beside x W, forwards and back."""

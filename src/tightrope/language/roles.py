@@ -17,12 +17,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.language import lora
 from tightrope.language.ledger import available_memory, check, job_of, ledger
 from tightrope.language.models import eos_ids, find_model, load_causal, load_tokenizer, parts
 from tightrope.language.settings import AlignSettings
-from tightrope.language.token_stats import Sampling, token_statistics
+from tightrope.language.token_stats import Sampling
 from tightrope.language.trunk import Trunk
 
 
@@ -158,60 +157,3 @@ def lowest_layer(model: Any, name: str) -> int:
         if name in lora.adapter_names(layer):
             return index
     raise ValueError(f"The model has no adapter {name!r}.")
-
-
-class PolicyModel:
-    """What ppo.update trains: Batch -> Evaluation, each [B, R]; padding is cut off before the forward pass.
-
-    ``exact``: also the exact KL to the reference of every state, left in ``kl`` for the loss ([B, R]).
-    """
-
-    def __init__(self, roles: Roles, *, exact: bool = False, critic_alone: bool = False) -> None:
-        self.roles, self.exact, self.critic_alone = roles, exact, critic_alone
-        self.kl: Tensor | None = None
-
-    def __call__(self, part: Batch) -> Evaluation:
-        """Log-probabilities and entropies of the policy, and the critic's values, where the mask is True."""
-        roles, mask = self.roles, part.mask
-        columns, length = mask.shape[1], part.inputs["tokens"].shape[1]
-        left, right = trimmed(part.inputs["real"], mask)
-        tokens, real = (part.inputs[name][:, left:right] for name in ("tokens", "real"))
-        lower = part.inputs["lower"][:, left:right] if "lower" in part.inputs else None
-        first = length - columns - left - 1  # the state in which the first response token is chosen
-        here = mask[:, : right - length + columns]
-
-        def steps(hidden: Tensor) -> Tensor:
-            return hidden[:, first : first + here.shape[1]][here]
-
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.critic_alone):
-            hidden = roles.policy_hidden(tokens, real, lower)
-        support = part.inputs.get("support")
-        reference = part.inputs.get("ref_hidden") if self.exact else None
-        found = token_statistics(
-            steps(hidden), roles.trunk.parts.head, part.actions[mask], roles.sampling,
-            support=None if support is None else support[mask],
-            reference=None if reference is None else reference[mask],
-            reference_head=roles.head_of_reference(),
-        )  # fmt: skip
-        values = found.logp.new_zeros(len(found.logp))
-        if roles.critic_head is not None:
-            critic = roles.critic_hidden(hidden, tokens, real, lower)
-            values = roles.critic_head(steps(critic).float())[:, 0]
-        logp, entropy, kl, values = (_spread(x, mask) for x in (*found, values))
-        self.kl = kl
-        return Evaluation(logp, entropy, values)
-
-
-def _spread(x: Tensor, mask: Tensor) -> Tensor:
-    """[N] numbers of the counting steps -> [B, R], 0 elsewhere."""
-    return torch.zeros(mask.shape, dtype=x.dtype, device=x.device).masked_scatter(mask, x)
-
-
-def trimmed(real: Tensor, mask: Tensor) -> tuple[int, int]:
-    """The columns [left, right) of [B, P + R] that hold a real prompt token or a counting response token."""
-    prompt = real.shape[1] - mask.shape[1]
-    any_prompt = real[:, :prompt].any(0).nonzero()
-    any_response = mask.any(0).nonzero()
-    left = int(any_prompt[0]) if len(any_prompt) else prompt - 1
-    right = prompt + (int(any_response[-1]) + 1 if len(any_response) else 1)
-    return left, right

@@ -14,8 +14,9 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser
 from tightrope.language.collect import Experience, gather, rewards_of, to_batch
 from tightrope.language.data import Prompt
+from tightrope.language.policy_model import PolicyModel
 from tightrope.language.rewards import Scores
-from tightrope.language.roles import PolicyModel, Roles, make_roles
+from tightrope.language.roles import Roles, make_roles
 from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.language.trainer import LOG_RATIO_LIMIT
 

@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-CHUNK = 1 << 22  # logits at a time: 16 MB in float32
+CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 
 
 @dataclass(frozen=True)
@@ -24,24 +25,30 @@ class Sampling:
 
 
 class TokenStatistics(NamedTuple):
-    """Of N tokens: log-probability, entropy of the state, KL(policy || reference) of the state; nats."""
+    """Of N tokens: log-probability, entropy of the state, KL(policy || reference) of the state, and the
+    token's log-probability by the reference; nats.
+    """
 
     logp: Tensor
     entropy: Tensor
     kl: Tensor
+    reference_logp: Tensor
 
 
-def shape_logits(logits: Tensor, sampling: Sampling, support: Tensor | None = None) -> Tensor:
+def shape_logits(
+    logits: Tensor, sampling: Sampling, support: Tensor | None = None, *, in_place: bool = False
+) -> Tensor:
     """Logits [N, V] of the head -> logits of the distribution in float32, [N, V], or [N, k] on a support.
 
     Divides by the temperature and forbids what must not be drawn. ``support`` [N, k]: the ids that top-k left
-    when the token was sampled; the others have probability 0 for every role.
+    when the token was sampled; the others have probability 0 for every role. ``in_place``: float32 logits
+    may be written over.
     """
-    shaped = logits.float()
+    shaped = logits.float() if in_place else logits.to(torch.float32, copy=True)
     if sampling.temperature != 1.0:
-        shaped = shaped / sampling.temperature
+        shaped.div_(sampling.temperature)
     if sampling.forbidden:
-        shaped = shaped.index_fill(1, torch.tensor(sampling.forbidden, device=shaped.device), -torch.inf)
+        shaped.index_fill_(1, torch.tensor(sampling.forbidden, device=shaped.device), -torch.inf)
     return shaped if support is None else shaped.gather(1, support)
 
 
@@ -54,11 +61,14 @@ def token_statistics(
     support: Tensor | None = None,
     reference: Tensor | None = None,
     reference_head: nn.Linear | None = None,
+    ahead: bool = False,
 ) -> TokenStatistics:
     """log p(token), the entropy and the exact KL to a reference, from hidden states [N, d]; each [N].
 
-    ``tokens`` [N]; ``reference`` [N, d]: hidden states of the reference, None: KL 0. Differentiable in
-    ``hidden`` and the head's weight; the backward pass computes each chunk of logits again.
+    ``tokens`` [N]; ``reference`` [N, d]: hidden states of the reference, None: KL and its log p are 0.
+    Differentiable in ``hidden`` and the head's weight, but for the reference's log p; the backward pass
+    computes each chunk of logits again. ``ahead``: it need not, because the gradient of log p is computed in
+    the forward pass, where the logits are; worth it when neither entropy nor KL nor the head are trained.
     ValueError when a token lies outside its support.
     """
     if support is not None and not bool((support == tokens[:, None]).any(1).all()):
@@ -74,6 +84,7 @@ def token_statistics(
         reference,
         other.weight,
         other.bias,
+        ahead and torch.is_grad_enabled() and hidden.requires_grad,
     )
     return TokenStatistics(*_Chunked.apply(*arguments))
 
@@ -85,77 +96,127 @@ class _Chunked(torch.autograd.Function):
     def forward(
         ctx: Any, hidden: Tensor, weight: Tensor, bias: Tensor | None, tokens: Tensor, sampling: Sampling,
         support: Tensor | None, reference: Tensor | None, reference_weight: Tensor,
-        reference_bias: Tensor | None,
-    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        reference_bias: Tensor | None, ahead: bool,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
         saved = (hidden, weight, bias, tokens, support, reference, reference_weight, reference_bias)
         ctx.save_for_backward(*saved)
-        ctx.sampling = sampling
-        logp, entropy, kl = (torch.empty(len(tokens), device=hidden.device) for _ in range(3))
-        for rows in _chunks(len(tokens), len(weight)):
-            p, logs, chosen, difference = _chunk(saved, sampling, rows)
-            logp[rows] = logs.gather(1, chosen[:, None])[:, 0]
-            entropy[rows] = -(p * logs).sum(1)
-            kl[rows] = 0.0 if difference is None else (p * difference).sum(1)
-        return logp, entropy, kl
+        ctx.sampling, ctx.slope = sampling, torch.empty_like(hidden) if ahead else None
+        chunks = _Chunks(saved, sampling)
+        logp, entropy, kl, theirs = (torch.zeros(len(tokens), device=hidden.device) for _ in range(4))
+        for rows in chunks:
+            p, logs, chosen = chunks.policy(rows)
+            logp[rows] = logs.gather(1, chosen)[:, 0]
+            entropy[rows] = -_dot(p, logs)[:, 0]
+            if reference is not None:
+                others = chunks.reference(rows)
+                theirs[rows] = others.gather(1, chosen)[:, 0]
+                kl[rows] = _dot(p, logs.sub_(others))[:, 0]
+            if ctx.slope is not None:
+                slope = p.neg_().scatter_add_(1, chosen, torch.ones_like(p[:, :1]))
+                ctx.slope[rows] = chunks.to_head(slope, rows) @ weight
+        ctx.mark_non_differentiable(theirs)
+        return logp, entropy, kl, theirs
 
     @staticmethod
     def backward(ctx: Any, *outer: Any) -> tuple[Any, ...]:
         hidden, weight, bias = ctx.saved_tensors[:3]
         need_hidden, need_weight, need_bias = ctx.needs_input_grad[:3]
+        states = [g if bool(g.any()) else None for g in outer[1:3]]
+        if ctx.slope is not None and states == [None, None] and not (need_weight or need_bias):
+            return ctx.slope * outer[0][:, None].to(hidden.dtype), *[None] * 9
         to_hidden = torch.empty_like(hidden) if need_hidden else None
         to_weight = torch.zeros_like(weight) if need_weight else None
         to_bias = torch.zeros_like(bias) if need_bias and bias is not None else None
-        for rows in _chunks(len(hidden), len(weight)):
-            gradient = _logit_gradient(ctx, rows, *(g[rows, None] for g in outer)).to(weight.dtype)
+        chunks = _Chunks(ctx.saved_tensors, ctx.sampling)
+        for rows in chunks:
+            here = [None if g is None else g[rows, None] for g in states]
+            gradient = chunks.gradient(rows, outer[0][rows, None], *here)
             if to_hidden is not None:
                 to_hidden[rows] = gradient @ weight
             if to_weight is not None:
-                to_weight += gradient.T @ hidden[rows]
+                to_weight.addmm_(gradient.T, hidden[rows])
             if to_bias is not None:
                 to_bias += gradient.sum(0)
-        return to_hidden, to_weight, to_bias, None, None, None, None, None, None
+        return to_hidden, to_weight, to_bias, *[None] * 7
 
 
-def _chunks(count: int, width: int) -> list[slice]:
-    size = max(1, CHUNK // width)
-    return [slice(start, start + size) for start in range(0, count, size)]
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Row by row, [n, 1], without their product in memory."""
+    return torch.bmm(a[:, None, :], b[:, :, None])[:, :, 0]
 
 
-def _chunk(
-    saved: tuple[Any, ...], sampling: Sampling, rows: slice
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Probabilities, their logarithms (0 where the probability is), places of the tokens, log p - log q."""
-    hidden, weight, bias, tokens, support, reference, other, other_bias = saved
-    allowed = None if support is None else support[rows]
-    logits = shape_logits(nn.functional.linear(hidden[rows], weight, bias), sampling, allowed)
-    logs = logits.log_softmax(1)
-    p = logs.exp()
-    impossible = logits == -torch.inf if sampling.forbidden else None
-    logs = logs if impossible is None else logs.masked_fill(impossible, 0.0)
-    chosen = tokens[rows] if allowed is None else (allowed == tokens[rows, None]).int().argmax(1)
-    difference = None
-    if reference is not None:
-        theirs = nn.functional.linear(reference[rows], other, other_bias)
-        theirs = shape_logits(theirs, sampling, allowed).log_softmax(1)
-        difference = logs - theirs if impossible is None else (logs - theirs).masked_fill(impossible, 0.0)
-    return p, logs, chosen, difference
+class _Chunks:
+    """Some rows at a time, in buffers that every chunk writes over: fresh memory costs more than the sums."""
 
+    def __init__(self, saved: tuple[Any, ...], sampling: Sampling) -> None:
+        self.hidden, self.weight, self.bias, self.tokens, self.support = saved[:5]
+        self.others, self.sampling = saved[5:], sampling
+        self.size = max(1, min(len(self.tokens), CHUNK // len(self.weight)))
+        self._buffers: dict[str, Tensor] = {}
 
-def _logit_gradient(ctx: Any, rows: slice, to_logp: Tensor, to_entropy: Tensor, to_kl: Tensor) -> Tensor:
-    """d/dz of logp: 1 - p;  of H: -p (log p + H);  of KL: p (log p - log q - KL); back to the head's [n,
-    V].
-    """
-    p, logs, chosen, difference = _chunk(ctx.saved_tensors, ctx.sampling, rows)
-    gradient = -to_logp * p
-    gradient.scatter_add_(1, chosen[:, None], to_logp)
-    entropy = -(p * logs).sum(1, keepdim=True)
-    gradient -= to_entropy * p * (logs + entropy)
-    if difference is not None:
-        gradient += to_kl * p * (difference - (p * difference).sum(1, keepdim=True))
-    if ctx.sampling.temperature != 1.0:
-        gradient /= ctx.sampling.temperature
-    support = ctx.saved_tensors[4]
-    if support is None:
-        return gradient
-    whole = gradient.new_zeros(len(gradient), len(ctx.saved_tensors[1]))
-    return whole.scatter_(1, support[rows], gradient)
+    def __iter__(self) -> Iterator[slice]:
+        for start in range(0, len(self.tokens), self.size):
+            yield slice(start, min(start + self.size, len(self.tokens)))
+
+    def policy(self, rows: slice) -> tuple[Tensor, Tensor, Tensor]:
+        """p and log p (0 where p is), [n, V] or on a support [n, k], and the places of the tokens [n, 1]."""
+        allowed = None if self.support is None else self.support[rows]
+        tokens = self.tokens[rows, None]
+        chosen = tokens if allowed is None else (allowed == tokens).int().argmax(1, keepdim=True)
+        return *self._distribution("p", self.hidden[rows], self.weight, self.bias, allowed), chosen
+
+    def reference(self, rows: slice) -> Tensor:
+        """log p of the reference, 0 where it is 0."""
+        hidden, weight, bias = self.others
+        allowed = None if self.support is None else self.support[rows]
+        return self._distribution("q", hidden[rows], weight, bias, allowed)[1]
+
+    def gradient(
+        self, rows: slice, to_logp: Tensor, to_entropy: Tensor | None, to_kl: Tensor | None
+    ) -> Tensor:
+        """d/dz of logp: 1 - p;  of H: -p (log p + H);  of KL: p (log p - log q - KL); back to the head's
+        [n, V]. None for a gradient that is 0 throughout.
+        """
+        p, logs, chosen = self.policy(rows)
+        inner = -to_logp
+        if to_entropy is not None:
+            inner = inner - to_entropy * (logs - _dot(p, logs))
+        if to_kl is not None and self.others[0] is not None:
+            difference = logs.sub_(self.reference(rows))
+            inner = inner + to_kl * (difference - _dot(p, difference))
+        return self.to_head(p.mul_(inner).scatter_add_(1, chosen, to_logp), rows)
+
+    def to_head(self, gradient: Tensor, rows: slice) -> Tensor:
+        """A gradient of shaped logits, written over, as one of the head's own logits [n, V]."""
+        if self.sampling.temperature != 1.0:
+            gradient /= self.sampling.temperature
+        if self.support is not None:
+            whole = gradient.new_zeros(len(gradient), len(self.weight))
+            gradient = whole.scatter_(1, self.support[rows], gradient)
+        return gradient.to(self.weight.dtype)
+
+    def _distribution(
+        self, name: str, hidden: Tensor, weight: Tensor, bias: Tensor | None, allowed: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Probabilities and their logarithms."""
+        logits = self._buffer(f"log {name}", len(hidden), len(weight), weight.dtype)
+        torch.mm(hidden, weight.T, out=logits)
+        if bias is not None:
+            logits += bias
+        logs = shape_logits(logits, self.sampling, allowed, in_place=True)
+        logs -= logs.amax(1, keepdim=True)
+        p = torch.exp(logs, out=self._buffer(name, len(logs), logs.shape[1], logs.dtype))
+        total = p.sum(1, keepdim=True)
+        p /= total
+        logs -= total.log()
+        if self.sampling.forbidden:  # 0 log 0 is 0
+            forbidden = torch.tensor(self.sampling.forbidden, device=logs.device)
+            logs.index_fill_(1, forbidden, 0.0) if allowed is None else logs.masked_fill_(
+                logs == -torch.inf, 0.0
+            )
+        return p, logs
+
+    def _buffer(self, name: str, rows: int, width: int, dtype: torch.dtype) -> Tensor:
+        if name not in self._buffers:
+            self._buffers[name] = torch.empty(self.size, width, dtype=dtype, device=self.hidden.device)
+        return self._buffers[name][:rows]

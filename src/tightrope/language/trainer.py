@@ -24,8 +24,9 @@ from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.models import context_length, find_model
 from tightrope.language.monitor import Monitor
+from tightrope.language.policy_model import PolicyModel
 from tightrope.language.ptx import Pretraining
-from tightrope.language.roles import PolicyModel, Roles, make_roles
+from tightrope.language.roles import Roles, make_roles
 from tightrope.language.samples import sample_rows
 from tightrope.language.saving import save_model, save_state
 from tightrope.language.scoring import (
