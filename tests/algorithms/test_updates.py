@@ -11,6 +11,7 @@ import torch
 from algorithms.models import TinyModel, make_batch
 
 from tightrope.algorithms import a2c, ppo, reinforce
+from tightrope.algorithms.batch import Evaluation
 from tightrope.algorithms.optimise import NonFiniteError, SamplingMismatch, make_optimiser
 from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings
 from tightrope.maths.statistics import masked_mean
@@ -90,6 +91,20 @@ def test_nan_behind_the_mask_changes_nothing(rule, settings):
     b, metrics_b = run(rule, settings, batch=dirty)
     assert torch.equal(weights(a), weights(b))
     assert metrics_a == metrics_b
+
+
+@pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
+def test_nan_that_a_model_says_behind_the_mask_changes_nothing(rule, settings):
+    class Babbling(TinyModel):
+        def forward(self, batch):
+            now = super().forward(batch)
+            poison = torch.where(batch.mask, 0.0, torch.nan)  # added: a bad gradient would pass through
+            return Evaluation(now.logp + poison, now.entropy + poison, now.values + poison)
+
+    batch = make_batch(TinyModel(), rows=12, columns=3, masked=0.5)
+    a, metrics_a = run(rule, settings, batch=batch)
+    b, metrics_b = run(rule, settings, batch=batch, model=Babbling())
+    assert torch.equal(weights(a), weights(b)) and metrics_a == metrics_b
 
 
 def test_every_row_is_used_once_an_epoch_and_the_last_minibatch_may_be_smaller():

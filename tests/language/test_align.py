@@ -120,8 +120,8 @@ def test_gpt2_without_pad_token(tmp_path):
 
 
 def test_a_run_that_goes_on_ends_where_one_without_a_break_does(folder, tmp_path):
-    """To the last bit: weights, optimiser, random numbers, prompt order."""
-    values = {**FAST, "checkpoint_every": 0.5}
+    """To the last bit: weights, optimiser, random numbers, prompt order, kl_beta."""
+    values = {**FAST, "checkpoint_every": 0.5, "kl_goal": 1.0, "kl_horizon": 100.0}
     whole = align(model=folder, prompts=PROMPTS, reward=letters, run_dir=tmp_path / "a", **values)
     half = tmp_path / "b"
 

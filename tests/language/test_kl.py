@@ -352,6 +352,30 @@ def test_nan_behind_the_mask_changes_nothing(form: str) -> None:
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("form", ALL_FORMS)
+def test_what_is_given_stays_as_it_is(form: str) -> None:
+    """The same tensors are reported as the KL: a weight multiplied in place would falsify the report."""
+    given = [LOGP.clone(), REF_LOGP.clone(), KL.clone(), MASK.clone()]
+    kl_rewards(form, 0.5, *given)
+    kl_loss(form, *given, 2, LOGP.clone())
+    for mine, theirs in zip(given, (LOGP, REF_LOGP, KL, MASK), strict=True):
+        assert torch.equal(mine, theirs)
+
+
+@pytest.mark.parametrize("far", [-30.0, 30.0])
+def test_no_clamp_takes_the_pull_away_far_from_the_reference(far: float) -> None:
+    """By hand at a log-ratio of 30: k1 has slope 1, k2 the log-ratio, k3 1 - exp(-log-ratio)."""
+    one = torch.ones(1, 1, dtype=torch.bool)
+    ref_logp = torch.full((1, 1), -40.0, dtype=torch.float64)
+    slopes = {"k1-loss": 1.0, "k2-loss": far, "k3-loss": 1 - math.exp(-far), "exact-loss": 1.0}
+    for form, slope in slopes.items():
+        logp = (ref_logp + far).requires_grad_()
+        loss = kl_loss(form, logp, ref_logp, logp - ref_logp, one, 1)
+        assert torch.autograd.grad(loss, logp)[0].item() == pytest.approx(slope)
+    logp = ref_logp + far
+    assert kl_rewards("k1-reward", 0.5, logp, ref_logp, None, one).item() == pytest.approx(-0.5 * far)
+
+
 @pytest.mark.parametrize("form", ["k1-loss", "k2-loss", "k3-loss"])
 def test_no_gradient_reaches_the_reference_or_the_weights(form: str) -> None:
     logp, ref_logp, log_ratio = (x.clone().requires_grad_() for x in (LOGP, REF_LOGP, LOGP))

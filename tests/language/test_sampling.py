@@ -4,9 +4,9 @@ nothing.
 
 import pytest
 import torch
-from language.tiny import tiny_gpt2, tiny_llama
+from language.tiny import saved, tiny_gpt2, tiny_llama
 
-from tightrope.language.models import without_dropout
+from tightrope.language.models import load_causal, without_dropout
 from tightrope.language.sampling import draw, positions, sample
 from tightrope.language.token_stats import Sampling, token_statistics
 from tightrope.language.trunk import Trunk
@@ -93,6 +93,19 @@ def test_a_response_ends_with_its_eos_and_nothing_behind_it_counts():
             assert len(kept) == 30
 
 
+def test_an_eos_in_the_last_place_that_there_is_ends_the_response():
+    """The longest response of a batch is not a cut one."""
+    model = tiny_llama()
+    tokens, real = prompts(rows=40)
+    numbers = uniforms(40, 30, seed=1)
+    whole = sample(model, tokens, real, Sampling(), numbers, EOS)
+    row = int(whole.ended.nonzero()[0])
+    own, length = slice(row, row + 1), int(whole.mask[row].sum())
+    for room, ended in ((length, True), (length - 1, False)):
+        got = sample(model, tokens[own], real[own], Sampling(), numbers[own, :room], EOS)
+        assert got.ended.tolist() == [ended] and got.mask.all()
+
+
 def test_frequencies_are_the_probabilities():
     """Inverse transform of evenly spaced uniforms: each token as often as its probability says, to one
     draw.
@@ -117,6 +130,17 @@ def test_frequencies_are_the_probabilities():
     with torch.no_grad():
         chosen, _, _ = draw(hidden.expand(2, 4), head, Sampling(forbidden=(0, 8)), ends)
     assert chosen.tolist() == [1, 7]
+
+
+@pytest.mark.parametrize("make", MODELS)
+def test_a_model_is_loaded_without_dropout(make, tmp_path):
+    """Whoever calls train() later: GPT-2 has dropout 0.1 in its config, and Llama is given some."""
+    model = make()
+    model.config.attention_dropout = 0.5
+    base = load_causal(saved(tmp_path, model)).train()
+    tokens, real = prompts()
+    trunk = Trunk(base)
+    assert torch.equal(trunk.hidden(tokens, real), trunk.hidden(tokens, real))
 
 
 def test_dropout_is_off_everywhere():

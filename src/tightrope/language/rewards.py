@@ -14,7 +14,7 @@ import inspect
 import math
 import re
 import sys
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Container, Coroutine, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -78,7 +78,8 @@ class Rewards:
     caller's thread. ``on_error``: "mask" masks and counts the samples of every fault, "raise" raises
     RewardError for every fault; None raises for mistakes in the code (exceptions, wrong length, wrong type)
     and masks for what data and world do (NaN, infinity, timeouts). None among the scores is no fault: the
-    function does not apply to that sample. A sample that no function applies to is always masked.
+    function does not apply to that sample. A sample that no function applies to is always masked. ``alone``
+    False: something else scores the responses too, and batches to which no function applies are no error.
 
     Raises ValueError for no function, something that cannot be called, a weight that is not finite, names
     that do not fit.
@@ -90,6 +91,7 @@ class Rewards:
         names: Sequence[str] | None = None,
         timeout: float | None = 300.0,
         on_error: Literal["mask", "raise"] | None = None,
+        alone: bool = True,
     ) -> None:
         pairs = [item if isinstance(item, tuple) else (item, 1.0) for item in functions]
         self.functions = [_checked_function(function) for function, _ in pairs]
@@ -99,7 +101,7 @@ class Rewards:
             raise ValueError(f"timeout is {timeout}, expected seconds above 0, or None for no limit.")
         if on_error not in (None, "mask", "raise"):
             raise ValueError(f"on_error is {on_error!r}, expected 'mask', 'raise' or None.")
-        self.timeout, self.on_error = timeout, on_error
+        self.timeout, self.on_error, self.alone = timeout, on_error, alone
         self._workers = [Worker(f"reward {name}") for name in self.names]
         self._loop = Loop("async rewards")
         self._empty_batches = 0
@@ -222,7 +224,11 @@ class Rewards:
         return part, faults
 
     def _refuse_to_learn_nothing(self, scores: Scores) -> None:
-        self._empty_batches = 0 if scores.valid.any() else self._empty_batches + bool(len(scores.valid))
+        lost = self.alone or any(fault.kind != "none" for fault in scores.faults)
+        if scores.valid.any():
+            self._empty_batches = 0
+        elif len(scores.valid) and lost:
+            self._empty_batches += 1
         if self._empty_batches >= EMPTY_BATCHES:
             raise RewardError(
                 f"Not one response of the last {self._empty_batches} batches has a score, so that nothing "
@@ -263,12 +269,17 @@ def _checked_names(functions: list[RewardFunction], names: Sequence[str] | None)
     for function in functions:
         plain = function.func if isinstance(function, partial) else function
         word = re.sub(r"\W+", "_", getattr(plain, "__name__", type(plain).__name__)).strip("_") or "reward"
-        name, same = word, 1
-        while name in own:
-            same += 1
-            name = f"{word}_{same}"
-        own.append(name)
+        own.append(unlike(own, word))
     return own
+
+
+def unlike(taken: Container[str], word: str) -> str:
+    """The word, with a number where it is taken."""
+    name, same = word, 1
+    while name in taken:
+        same += 1
+        name = f"{word}_{same}"
+    return name
 
 
 def length(completion_ids: list[list[int]], **_: Any) -> list[float]:

@@ -5,7 +5,6 @@ functions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tightrope.language.answers import Fault, RewardError
 from tightrope.language.collect import Experience
 from tightrope.language.data import Prompt
 from tightrope.language.reward_model import RewardModel, last_real, load_reward
-from tightrope.language.rewards import Rewards, Scores, load_reward_function
+from tightrope.language.rewards import Rewards, Scores, load_reward_function, unlike
 from tightrope.language.roles import Roles
 
 
@@ -42,15 +42,10 @@ class Judge:
         """Scores of the responses to ``prompts``, one prompt a response."""
         found = self._of_functions(prompts, experience, trainer_state)
         learnt = self._of_model(experience)
-        if learnt is None:
-            assert found is not None
-            return found
-        good = np.isfinite(learnt)
-        if found is None:
-            metrics: dict[str, float] = {}
-            return Scores(np.where(good, learnt, np.nan), good, {"reward_model": learnt}, metrics, {})
-        parts = {**found.parts, "reward_model": learnt}
-        return replace(found, total=found.total + learnt, valid=found.valid & good, parts=parts)
+        if learnt is not None:
+            return with_model(found, learnt)
+        assert found is not None
+        return found
 
     def _of_functions(self, prompts: Sequence[Prompt], experience: Experience, state: Any) -> Scores | None:
         if self.functions is None:
@@ -83,6 +78,40 @@ class Judge:
             hidden = self.roles.adapter_hidden("reward", tokens, real, lower)
             scores.append((last_real(hidden, real).float() @ head.float().T)[:, 0] - shift)
         return torch.cat(scores).double().cpu().numpy()
+
+
+def with_model(found: Scores | None, learnt: np.ndarray) -> Scores:
+    """The functions' scores and a reward model's, [B], added up.
+
+    Where no function applies the model's stands alone. A score of the model that is not finite masks its
+    response. RewardError when none is finite: the model is broken.
+    """
+    good = np.isfinite(learnt)
+    if not good.any():
+        raise RewardError(
+            f"The reward model gave {learnt[0]} for sample 0 of {len(learnt)} and no finite score for any "
+            "other: its weights are not usable. Train it again, or give another."
+        )
+    if found is None:
+        found = Scores(np.zeros(len(learnt)), np.ones(len(learnt), bool), {}, {}, {})
+    alone = np.zeros(len(learnt), bool)
+    alone[[sample for fault in found.faults if fault.kind == "none" for sample in fault.samples]] = True
+    valid = (found.valid | alone) & good
+    part, name = np.where(good, learnt, np.nan), unlike(found.parts, "reward_model")
+    faults = [fault for fault in found.faults if fault.kind != "none"]
+    if not good.all():
+        bad = tuple(np.flatnonzero(~good).tolist())
+        where = f"sample {bad[0]} of {len(learnt)}" + (f" and {len(bad) - 1} more" if len(bad) > 1 else "")
+        text = f"The reward model gave {learnt[bad[0]]} for {where}, expected a finite number."
+        faults.append(Fault(name, "not finite", bad, text))
+    return Scores(
+        total=np.where(valid, np.where(alone, 0.0, found.total) + part, np.nan),
+        valid=valid,
+        parts={**found.parts, name: part},
+        metrics={**found.metrics, f"scores/{name}": float(part[good].mean())},
+        extras=found.extras,
+        faults=faults,
+    )
 
 
 def is_folder(reward: Any) -> bool:
@@ -135,7 +164,10 @@ def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: flo
                 f"reward is {entry!r}; expected a function, (function, weight), 'length', FILE.py:function, "
                 "or the folder of a reward model."
             )
-    return Judge(roles, Rewards(functions, timeout=timeout) if functions else None, model, adapter)
+    alone = model is None and adapter is None
+    return Judge(
+        roles, Rewards(functions, timeout=timeout, alone=alone) if functions else None, model, adapter
+    )
 
 
 def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:

@@ -1,0 +1,129 @@
+"""The loop of an alignment run: every part gets what is meant for it, nothing twice and nothing stale."""
+
+import numpy as np
+import pytest
+import torch
+from language.tiny import saved, tiny_llama
+
+from tightrope.algorithms import ppo
+from tightrope.language import lora
+from tightrope.language.fitting import silent
+from tightrope.language.kl import KL_FORMS, AdaptiveKL
+from tightrope.language.settings import AlignSettings, RewardSettings
+from tightrope.language.trainer import Trainer
+
+PROMPTS = ["ab", "cde", "f", "ghij"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A model with many stops: responses of all lengths."""
+    model = tiny_llama()
+    model.generation_config.eos_token_id = [*range(3, 12)]
+    return saved(tmp_path_factory.mktemp("model"), model)
+
+
+def letters(completions, **_):
+    return [sum(c in "abcdefghijklm" for c in text) / 6 for text in completions]
+
+
+def nothing(completions, **_):
+    return [0.0] * len(completions)
+
+
+def trainer(folder, reward=letters, **values):
+    usual = {
+        "total_episodes": 32, "batch_size": 16, "minibatch_size": 8, "max_new_tokens": 6, "lora_rank": 4,
+        "learning_rate": 1e-2, "seed": 1,
+    }  # fmt: skip
+    settings = AlignSettings(model=folder).with_values(**{**usual, **values})
+    return Trainer(settings, PROMPTS, reward, None, silent)
+
+
+def shaken(made):
+    """The same trainer with a policy that has left the reference."""
+    generator = torch.Generator().manual_seed(1)
+    for parameter in lora.adapter_parameters(made.roles.model, "policy"):
+        parameter.data += 0.04 * torch.randn(parameter.shape, generator=generator)
+    return made
+
+
+@pytest.mark.parametrize("form", KL_FORMS)
+def test_where_nothing_is_to_be_earned_the_kl_leads_back_to_the_reference(folder, form):
+    """The sign of the KL where it acts: turned round, the policy would flee."""
+    made = shaken(
+        trainer(folder, nothing, kl=form, kl_beta=1.0, total_episodes=320, batch_size=64, learning_rate=3e-3)
+    )
+    found = [metrics["objective/kl_exact"] for metrics, _ in made.iterate()]
+    assert found[0] > 0.2 and found[-1] < 0.7 * found[0], found
+
+
+def test_kl_beta_follows_the_kl_of_whole_responses_once_a_rollout(folder):
+    """The goal lies beside the KL, so that the error is not clipped and its size tells what was fed."""
+    still = {"total_episodes": 64, "learning_rate": 1e-6, "kl_beta": 0.2, "kl_horizon": 100.0}
+    first, _ = next(shaken(trainer(folder, **still)).iterate())
+    goal = 0.95 * first["objective/kl"]
+    made, control = shaken(trainer(folder, kl_goal=goal, **still)), AdaptiveKL(0.2, goal, horizon=100.0)
+    for metrics, _ in made.iterate():
+        assert metrics["objective/kl_beta"] == pytest.approx(control.kl_beta)
+        control = control.next(metrics["objective/kl"], 16)
+        assert made.kl_beta == pytest.approx(control.kl_beta) and made.kl_beta != 0.2
+
+
+@pytest.mark.parametrize("tune, critic", [("lora", "head"), ("lora", "adapter"), ("full", "separate")])
+def test_every_weight_of_the_critic_is_trained(folder, tune, critic):
+    made = trainer(folder, tune=tune, critic=critic, critic_learning_rate=1e-2)
+    before = [p.detach().clone() for p in made.roles.critic_parameters()]
+    for _ in made.iterate():
+        pass
+    after = made.roles.critic_parameters()
+    assert before and not any(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("form", ["exact-split", "k2-loss"])
+def test_micro_batches_change_no_metric(folder, form):
+    values = {"kl": form, "num_epochs": 1, "total_episodes": 16, "kl_beta": 0.5, "value_clip": 0.2}
+    found = []
+    for micro in (None, 3):
+        made = shaken(trainer(folder, micro_batch_size=micro, **values))
+        ((metrics, _),) = made.iterate()
+        found.append({name: x for name, x in metrics.items() if name[:5] != "time/"})
+    assert found[0] == pytest.approx(found[1], rel=1e-2, abs=1e-4)
+    assert found[0]["train/kl_loss"] > 0.05
+
+
+def test_the_settings_of_the_update_reach_the_update(folder, monkeypatch):
+    values = {
+        "dual_clip": 3.0, "clip": 0.1, "clip_high": 0.3, "value_clip": 0.4, "value_weight": 0.7,
+        "entropy_weight": 0.01, "max_grad_norm": 0.5, "num_epochs": 2, "target_kl": 0.9,
+        "micro_batch_size": 5, "adam_eps": 1e-4, "critic_learning_rate": 1e-3,
+    }  # fmt: skip
+    seen, real = [], ppo.update
+
+    def spy(model, optimiser, batch, settings, *rest, **more):
+        seen.append((settings, optimiser))
+        return real(model, optimiser, batch, settings, *rest, **more)
+
+    monkeypatch.setattr(ppo, "update", spy)
+    made = trainer(folder, total_episodes=16, **values)
+    ((_, _),) = made.iterate()
+    ((settings, optimiser),) = seen
+    assert {name: getattr(settings, name) for name in values} == values and settings.gamma == 1.0
+    assert [group["lr"] for group in optimiser.param_groups] == [1e-2, 1e-3]
+    assert {group["eps"] for group in optimiser.param_groups} == {1e-4}
+
+
+def test_a_critic_made_of_the_reward_model_begins_with_its_scores(folder, tmp_path):
+    from tightrope.language.reward_model import train_reward
+
+    rows = [{"prompt": "ab", "chosen": "x" * n, "rejected": "y" * n} for n in range(1, 9)]
+    values = {"tune": "lora", "lora_rank": 4, "max_tokens": 32, "learning_rate": 1e-2, "threads": 1}
+    train_reward(RewardSettings(model=folder, **values), data=rows, run_dir=tmp_path / "run")
+    made = trainer(folder, str(tmp_path / "run"), critic="adapter", critic_from_reward=True)
+    from tightrope.language.collect import gather
+
+    prompts = made.prompts
+    experience = gather(made.roles, prompts, 1, 0, 1)
+    scores = made.judge(prompts, experience)
+    np.testing.assert_allclose(experience.final_values.numpy(), scores.total, rtol=1e-3, atol=1e-3)
+    assert scores.total.std() > 0.01
