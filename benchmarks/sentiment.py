@@ -23,7 +23,7 @@ from speed import machine
 from speed_report import fill
 from speed_runs import HERE, our_environment
 
-RESULTS = HERE / "results" / "rlhf" / "sentiment.json"
+RESULTS = HERE / "results" / "language" / "sentiment.json"
 PAGE = HERE.parent / "docs" / "benchmarks.md"
 DEMO = HERE.parent / "demos" / "sentiment.py"
 SEEDS = (11, 12, 13, 14, 15)

@@ -18,6 +18,7 @@ from tightrope.options import (
     Options,
     evaluate_parser,
     overrides,
+    print_json,
     record_parser,
     resume_parser,
     train_options,
@@ -80,7 +81,7 @@ def evaluate(words: list[str]) -> int:
     names = ("episodes", "stochastic", "best", "seed", "env", "device")
     result = evaluate_run(given["run"], **{name: given[name] for name in names if name in given})
     if given.get("json"):
-        _print_json(result)
+        print_json(result)
     else:
         low, high = _interval(result)
         count = result["episodes"]
@@ -100,7 +101,7 @@ def record(words: list[str]) -> int:
     names = ("out", "best", "episodes", "seed", "env")
     result = record_run(given["run"], **{name: given[name] for name in names if name in given})
     if given.get("json"):
-        _print_json(result)
+        print_json(result)
     else:
         print(f"{result['path']}  ({result['frames']} frames)")
     return 0
@@ -183,7 +184,7 @@ def _watched(run: Callable[[Any], dict[str, Any]], given: Options) -> int:
             )
         return 130
     if as_json:
-        _print_json({**summary, "run_dir": report.run})
+        print_json({**summary, "run_dir": report.run})
     else:
         _print_end(summary, report.run or "", given, quiet, stream)
     return 0
@@ -238,12 +239,6 @@ def _interval(result: dict[str, Any]) -> tuple[float, float]:
         if isinstance(ci, list | tuple)
         else (result["mean_return"] - ci, result["mean_return"] + ci)
     )
-
-
-def _print_json(value: dict[str, Any]) -> None:
-    from tightrope.runs.records import dumps
-
-    print(dumps(value), flush=True)
 
 
 def _help() -> str:

@@ -21,7 +21,7 @@ from tightrope.language.settings import (
     RLHFSettings,
     SFTSettings,
 )
-from tightrope.options import PROGRAM, output
+from tightrope.options import PROGRAM, output, print_json
 
 NEEDED = "The language story needs transformers. Install it with: pip install 'tightrope[language]'"
 
@@ -154,7 +154,7 @@ def sample(words: list[str]) -> int:
 
     rows = sample_run(given["run"], **{k: given[k] for k in ("prompt", "count", "seed") if k in given})
     if given.get("json"):
-        _print_json({"samples": rows})
+        print_json({"samples": rows})
     else:
         from tightrope.language.samples import print_comparison
 
@@ -178,7 +178,7 @@ def doctor(words: list[str]) -> int:
 
     findings = examine(given.get("model"))
     if given.get("json"):
-        _print_json({"findings": [finding._asdict() for finding in findings]})
+        print_json({"findings": [finding._asdict() for finding in findings]})
     else:
         for finding in findings:
             print(f"{'ok  ' if finding.good else 'BAD '} {finding.what}: {finding.seen}")
@@ -284,7 +284,7 @@ def _watched(run: Callable[[Any], dict[str, Any]], columns: Any, what: str, give
         print(f"Stopped at {display.step:,} {what}.{go_on}", file=sys.stderr)
         return 130
     if as_json:
-        _print_json({**summary, "run_dir": display.run})
+        print_json({**summary, "run_dir": display.run})
         return 0
     for name, value in (summary.get("final") or {}).items():
         if isinstance(value, int | float) and not quiet:
@@ -296,9 +296,3 @@ def _watched(run: Callable[[Any], dict[str, Any]], columns: Any, what: str, give
         model = Path(display.run) / "model"
         print(f"model        {model}", file=stream)
     return 0
-
-
-def _print_json(value: dict[str, Any]) -> None:
-    from tightrope.runs.records import dumps
-
-    print(dumps(value), flush=True)

@@ -6,7 +6,8 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
-from typing import NamedTuple
+
+from tightrope.runs.findings import Finding
 
 OPTIONAL = {
     "transformers": ("the language story", "pip install 'tightrope[language]'"),
@@ -15,15 +16,6 @@ OPTIONAL = {
     "ale_py": ("Atari", "pip install 'tightrope[atari]'"),
     "imageio_ffmpeg": ("tightrope record", "pip install 'tightrope[video]'"),
 }
-
-
-class Finding(NamedTuple):
-    """One thing that was looked at: what, whether it is as it should be, what was seen, what to do if not."""
-
-    what: str
-    good: bool
-    seen: str
-    advice: str = ""
 
 
 def examine(model: str | None = None) -> list[Finding]:
@@ -37,7 +29,7 @@ def examine(model: str | None = None) -> list[Finding]:
     if model is not None:
         from tightrope.language.selfcheck import check_model
 
-        found += [Finding(*finding) for finding in check_model(model)]
+        found += check_model(model)
     return found
 
 

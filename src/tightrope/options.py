@@ -33,6 +33,13 @@ GROUPS = {
 Options = dict[str, Any]
 
 
+def print_json(value: dict[str, Any]) -> None:
+    """A line of JSON on standard output: what --json promises, numbers that JSON cannot hold as null."""
+    from tightrope.runs.records import dumps
+
+    print(dumps(value), flush=True)
+
+
 def output(parser: Parser) -> None:
     """The options about what is printed, which every command has."""
     group = parser.add_argument_group("output")

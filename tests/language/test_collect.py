@@ -174,7 +174,9 @@ def test_whitened_rewards_are_divided_by_the_deviation_of_what_counts_and_keep_t
 
 
 def test_every_metric_of_a_rollout_by_hand():
-    """Three responses of 2, 3 and 1 tokens, the second masked; sums over a response, means where named so."""
+    """Three responses of 2, 3 and 1 tokens; sums over a response, means where named so. The second has no
+    score: it tells of the policy as the others do, and of the reward nothing.
+    """
     nan = math.nan
     mask = torch.tensor([[True, True, False], [True, True, True], [True, False, False]])
     logp = torch.tensor([[-1.0, -2.0, nan], [-9.0, -9.0, -9.0], [-0.5, nan, nan]])
@@ -190,26 +192,47 @@ def test_every_metric_of_a_rollout_by_hand():
     )  # fmt: skip
     rewards = torch.tensor([[-0.1, 1.0, 0.0], [5.0, 5.0, 5.0], [0.5, 0.0, 0.0]])
     found = describe(experience, scores_of(1.0, nan, 0.5), rewards, torch.tensor([True, False, True]))
-    k1 = [0.5, -1.0, -0.25]  # log p - log p_ref, negative ones too
+    k1 = [0.5, -1.0, -8.0, -8.0, -8.0, -0.25]  # log p - log p_ref, negative ones too
     wanted = {
-        "objective/kl": sum(k1) / 2,
-        "objective/kl_token_mean": sum(k1) / 3,
-        "objective/kl_k2": sum(x * x / 2 for x in k1) / 2,
-        "objective/kl_k3": sum(math.exp(-x) - 1 + x for x in k1) / 2,
-        "objective/kl_exact": 0.9 / 2,
+        "objective/kl": sum(k1) / 3,
+        "objective/kl_token_mean": sum(k1) / 6,
+        "objective/kl_k2": sum(x * x / 2 for x in k1) / 3,
+        "objective/kl_k3": sum(math.exp(-x) - 1 + x for x in k1) / 3,
+        "objective/kl_exact": 21.9 / 3,
         "objective/scores": 0.75,
         "objective/scores_std": 0.25,
         "objective/rlhf_reward": 1.4 / 2,
         "objective/non_score_reward": 0.7 - 0.75,
-        "objective/entropy": 3.5 / 2,
-        "objective/entropy_token_mean": 0.5,
-        "objective/response_length": 1.5,
-        "objective/eos_fraction": 0.5,
-        "objective/truncated_fraction": 0.5,
+        "objective/entropy": 30.5 / 3,
+        "objective/entropy_token_mean": 22.5 / 6,
+        "objective/response_length": 2.0,
+        "objective/eos_fraction": 2 / 3,
+        "objective/truncated_fraction": 1 / 3,
         "objective/masked_samples": 1.0,
         "objective/distinct_2": 2 / 3,
         "objective/sampling_gap": 0.0,
         "time/generate_seconds": 2.0,
         "time/tokens_per_second": 3.0,
     }
-    assert found == {name: pytest.approx(value, abs=1e-6) for name, value in wanted.items()}
+    assert found == {name: pytest.approx(value, rel=1e-6, abs=1e-6) for name, value in wanted.items()}
+
+
+def test_where_no_response_counts_the_kl_is_known_and_the_score_is_not(folder):
+    """A KL of 0 there would lift every budget, and be a false point of the over-optimisation curve."""
+    _, experience = experienced(settings(folder))
+    experience.ref_logp -= 1.0
+    some = describe(experience, scores_of(*range(6)), torch.zeros(6, 10), EVERY)
+    none = describe(experience, scores_of(*[math.nan] * 6), torch.zeros(6, 10), ~EVERY)
+    assert none["objective/kl"] == some["objective/kl"] > 1
+    assert math.isnan(none["objective/scores"]) and math.isnan(none["objective/rlhf_reward"])
+
+
+def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(folder):
+    """The log-probabilities trained against come from the pass that trains, not from the KV cache."""
+    roles, experience = experienced(settings(folder, dtype="bfloat16"))
+    batch = to_batch(experience, torch.zeros(6, 10), EVERY, roles.settings)
+    with torch.no_grad():
+        now = PolicyModel(roles)(batch).logp
+    trained = (now - batch.old_logp)[batch.mask].abs().max()
+    sampled = (now - experience.responses.logp)[batch.mask].abs().max()
+    assert trained < 1e-3 < 1e-2 < sampled

@@ -57,14 +57,22 @@ def test_the_peak_is_where_the_curve_is_highest():
 
 def test_the_interval_covers_the_peak_as_often_as_it_says():
     """80 %, within what 300 runs can tell."""
-    rng, covered, errors = np.random.default_rng(1), 0, []
+    rng, covered, errors, explained = np.random.default_rng(1), 0, [], []
     for _ in range(300):
         found = fit(noisy_run(rng, np.linspace(0.2, 30, 20), noise=0.03))
         covered += found.peak_kl_low <= PEAK_KL <= found.peak_kl_high
         errors.append(abs(found.peak_kl - PEAK_KL) / PEAK_KL)
-        assert found.r2 > 0.8
+        explained.append(found.r2)
+    assert np.median(explained) > 0.9
     assert 0.74 <= covered / 300 <= 0.86
     assert np.median(errors) < 0.1
+
+
+def test_a_slow_start_does_not_hide_the_top():
+    """PPO's gold score stays flat at first, where the law rises steepest; the far points must decide."""
+    law = noisy_run(np.random.default_rng(2), np.linspace(0.2, 20, 25), noise=0.01)
+    delayed = [(kl, gold * min(1.0, math.sqrt(kl) / 3)) for kl, gold in law]
+    assert fit(delayed).peak_kl == pytest.approx(PEAK_KL, rel=0.3)
 
 
 @given(st.lists(st.tuples(st.floats(-1, 50), st.floats(-3, 3)), max_size=12), st.randoms())

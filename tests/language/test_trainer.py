@@ -7,8 +7,10 @@ from language.tiny import saved, tiny_llama
 
 from tightrope.algorithms import ppo
 from tightrope.language import lora
+from tightrope.language.collect import gather
 from tightrope.language.fitting import silent
 from tightrope.language.kl import KL_FORMS, AdaptiveKL
+from tightrope.language.reward_model import train_reward
 from tightrope.language.settings import AlignSettings, RewardSettings
 from tightrope.language.trainer import Trainer
 
@@ -113,17 +115,26 @@ def test_the_settings_of_the_update_reach_the_update(folder, monkeypatch):
     assert {group["eps"] for group in optimiser.param_groups} == {1e-4}
 
 
-def test_a_critic_made_of_the_reward_model_begins_with_its_scores(folder, tmp_path):
-    from tightrope.language.reward_model import train_reward
-
+@pytest.mark.parametrize("critic", ["adapter", "separate"])
+@pytest.mark.parametrize("tune", ["lora", "full"])
+def test_a_critic_made_of_the_reward_model_begins_with_its_scores(folder, tmp_path, critic, tune):
     rows = [{"prompt": "ab", "chosen": "x" * n, "rejected": "y" * n} for n in range(1, 9)]
-    values = {"tune": "lora", "lora_rank": 4, "max_tokens": 32, "learning_rate": 1e-2, "threads": 1}
+    values = {"tune": tune, "lora_rank": 4, "max_tokens": 32, "learning_rate": 1e-2, "threads": 1}
     train_reward(RewardSettings(model=folder, **values), data=rows, run_dir=tmp_path / "run")
-    made = trainer(folder, str(tmp_path / "run"), critic="adapter", critic_from_reward=True)
-    from tightrope.language.collect import gather
-
-    prompts = made.prompts
-    experience = gather(made.roles, prompts, 1, 0, 1)
-    scores = made.judge(prompts, experience)
+    reward = str(tmp_path / "run")
+    if (critic, tune) == ("adapter", "full"):
+        with pytest.raises(ValueError, match="critic separate"):
+            trainer(folder, reward, critic=critic, critic_from_reward=True)
+        return
+    made = trainer(folder, reward, critic=critic, critic_from_reward=True)
+    experience = gather(made.roles, made.prompts, 1, 0, 1)
+    scores = made.judge(made.prompts, experience)
     np.testing.assert_allclose(experience.final_values.numpy(), scores.total, rtol=1e-3, atol=1e-3)
     assert scores.total.std() > 0.01
+
+
+def test_a_head_on_the_policy_cannot_be_made_of_a_reward_model(folder, tmp_path):
+    with pytest.raises(ValueError, match="critic 'head': expected the folder"):
+        trainer(folder, critic="head", critic_from_reward=True)
+    with pytest.raises(ValueError, match="expected the folder of a reward model"):
+        trainer(folder, letters, critic="separate", critic_from_reward=True)

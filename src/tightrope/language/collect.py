@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -87,10 +88,14 @@ def gather(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, s
         responses = sample(
             roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples
         )
-        seconds = time.perf_counter() - begin
-        tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
-        real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
-        size = settings.update.micro_batch_size or rows
+    seconds = time.perf_counter() - begin
+    tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
+    real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
+    size = settings.update.micro_batch_size or rows
+    # a folded weight rounds otherwise than weight and adapter apart, which is what trains: in float32 within
+    # the tolerance, in bfloat16 far beyond it
+    exact = settings.dtype == "float32"
+    with roles.frozen_policy() if exact else contextlib.nullcontext():
         pieces = [_look(roles, tokens, real, responses, slice(k, k + size)) for k in range(0, rows, size)]
     joined = {name: _joined([piece[name] for piece in pieces]) for name in pieces[0]}
     return Experience(tokens=tokens, real=real, responses=responses, seconds=seconds, **joined)
@@ -213,33 +218,37 @@ def leave_one_out(rewards: Tensor, mask: Tensor, valid: Tensor, samples: int) ->
 
 
 def describe(experience: Experience, scores: Scores, rewards: Tensor, valid: Tensor) -> dict[str, float]:
-    """The metrics of a rollout: sums over a response, and token means under names that say so."""
-    mask = experience.responses.mask & valid[:, None]
-    count = max(1, int(valid.sum()))
+    """The metrics of a rollout: sums over a response, and token means under names that say so.
+
+    Scores and rewards are those of the responses that count, everything else is of all of them; NaN for a
+    score where none counts.
+    """
+    mask = experience.responses.mask
+    count = len(mask)
     log_ratio = torch.where(mask, experience.ref_logp - experience.logp, 0.0)
 
     def per_response(x: Tensor) -> float:
         return float(masked_sum(x, mask)) / count
 
-    total = scores.total[scores.valid]
-    kl, lengths = per_response(divergence.k1(log_ratio)), mask.sum(1)[valid].float()
+    total, ended = scores.total[scores.valid], experience.responses.ended
+    counting = float(masked_sum(rewards, mask & valid[:, None])) / len(total) if len(total) else float("nan")
     score = float(np.mean(total)) if len(total) else float("nan")
     gap = (experience.responses.logp - experience.logp)[mask].abs()
     return {
-        "objective/kl": kl,
+        "objective/kl": per_response(divergence.k1(log_ratio)),
         "objective/kl_k2": per_response(divergence.k2(log_ratio)),
         "objective/kl_k3": per_response(divergence.k3(log_ratio)),
         "objective/kl_exact": per_response(experience.exact),
         "objective/kl_token_mean": float(masked_mean(divergence.k1(log_ratio), mask)),
         "objective/scores": score,
         "objective/scores_std": float(np.std(total)) if len(total) else float("nan"),
-        "objective/rlhf_reward": per_response(rewards),
-        "objective/non_score_reward": per_response(rewards) - score,
+        "objective/rlhf_reward": counting,
+        "objective/non_score_reward": counting - score,
         "objective/entropy": per_response(-experience.logp),
         "objective/entropy_token_mean": float(masked_mean(experience.entropy, mask)),
-        "objective/response_length": float(lengths.mean()) if len(lengths) else 0.0,
-        "objective/eos_fraction": float(experience.responses.ended[valid].float().mean()) if count else 0.0,
-        "objective/truncated_fraction": float((~experience.responses.ended[valid]).float().mean()),
+        "objective/response_length": float(mask.sum()) / count,
+        "objective/eos_fraction": float(ended.float().mean()),
+        "objective/truncated_fraction": float((~ended).float().mean()),
         "objective/masked_samples": float((~valid).sum()),
         "objective/distinct_2": distinct(experience.ids()),
         "objective/sampling_gap": float(gap.max()) if gap.numel() else 0.0,

@@ -4,7 +4,9 @@
 
 is how the gold score follows a policy that PPO drives away from its reference (Gao, Schulman & Hilton 2022,
 arXiv 2210.10760; alpha hardly depends on the size of the reward model, beta falls with it). It has its top
-at d = exp(alpha / beta - 1), known before it is reached once the curve bends.
+at d = exp(alpha / beta - 1), known before it is reached once the curve bends. Where the policy has hardly
+left the reference the curve of a real run is flatter than the law, and says little of the top: a point counts
+the more the farther out it lies.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ FEWEST_POINTS = 5  # three parameters, and two degrees of freedom to judge them 
 SPREAD = 2.0  # the largest d over the smallest but zero: within less the curve looks straight
 FARTHEST = 10.0  # times the largest KL seen: a top beyond it is no prediction
 DRAWS = 2000
+POWER = 2.5  # a residual weighs (d / the largest d) to this power
 NEAR = 0.5  # of the predicted KL: d is then 0.71 of the top's, and gold within 5 % of what can be had
 WINDOWS = (8, 16, 32)  # evaluations over which proxy and gold are compared
 SIGNIFICANCE = 0.0003  # one-sided, of each of the two slopes: the test is made at every evaluation
@@ -27,7 +30,7 @@ SIGNIFICANCE = 0.0003  # one-sided, of each of the two slopes: the test is made 
 
 @dataclass(frozen=True)
 class Fit:
-    """gold(d) = offset + d (alpha - beta log d) by least squares.
+    """gold(d) = offset + d (alpha - beta log d) by weighted least squares.
 
     ``peak_d`` and ``peak_kl`` = peak_d^2 (nats): the predicted top, inf where the curve does not bend down.
     ``peak_kl_low`` to ``peak_kl_high``: 80 % of the tops that the points allow, inf where more than a tenth
@@ -66,16 +69,18 @@ def fit(points: Sequence[tuple[float, float]]) -> Fit:
     reason = _too_little(d)
     if reason:
         return Fit(points=len(pairs), reason=reason)
+    weights = np.maximum((d / d.max()) ** POWER, 1e-3)
     bend = -d * np.log(np.where(d > 0, d, 1.0))
-    columns = np.stack([d, bend, np.ones_like(d)], 1)
+    columns = np.stack([d, bend, np.ones_like(d)], 1) * weights[:, None]
     size = np.linalg.norm(columns, axis=0)
-    solution, _, rank, _ = np.linalg.lstsq(columns / size, gold, rcond=1e-8)
+    solution, _, rank, _ = np.linalg.lstsq(columns / size, gold * weights, rcond=1e-8)
     if rank < 3:
         return Fit(points=len(pairs), reason="the KLs of the points are too much alike")
     alpha, beta, offset = solution / size
-    left = gold - columns @ (solution / size)
+    left = gold * weights - columns @ (solution / size)
     squares, spread = float(left @ left), float(np.square(gold - gold.mean()).sum())
-    tops = _possible_tops(columns / size, solution, squares, size)
+    unexplained = float(np.square(left / weights).sum())
+    tops = _possible_tops(columns / size, weights, solution, squares, size)
     peak_d, high = float(_top(alpha, beta)), float(tops[-(DRAWS // 10)])
     return Fit(
         alpha=float(alpha),
@@ -85,7 +90,7 @@ def fit(points: Sequence[tuple[float, float]]) -> Fit:
         peak_kl=peak_d**2,
         peak_kl_low=float(tops[DRAWS // 10]),
         peak_kl_high=high,
-        r2=1.0 - squares / spread if spread > 0 else math.nan,
+        r2=1.0 - unexplained / spread if spread > 0 else math.nan,
         points=len(pairs),
         decided=high <= FARTHEST * float(kl.max()),
     )
@@ -109,15 +114,21 @@ def _top(alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
     return np.where(power < 300.0, np.exp(np.minimum(power, 300.0)), np.inf)  # e^300: never
 
 
-def _possible_tops(scaled: np.ndarray, solution: np.ndarray, squares: float, size: np.ndarray) -> np.ndarray:
-    """The top's KL for parameters drawn as least squares leaves them in doubt, Student's t around the fit;
-    [DRAWS], ascending. The draws are always the same ones: a fit is a function of its points.
+def _possible_tops(
+    scaled: np.ndarray, weights: np.ndarray, solution: np.ndarray, squares: float, size: np.ndarray
+) -> np.ndarray:
+    """The top's KL for parameters drawn as the fit leaves them in doubt, Student's t around it; [DRAWS],
+    ascending. All gold scores are taken for equally noisy, whatever they weigh. The draws are always the same
+    ones: a fit is a function of its points.
     """
-    freedom = len(scaled) - 3
+    total = float(np.sum(weights**2))
+    freedom = max(1.0, total**2 / float(np.sum(weights**4)) - 3)  # points, had all the same weight, less 3
+    variance = squares / total * (freedom + 3) / freedom
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((DRAWS, 3)) / np.sqrt(rng.chisquare(freedom, (DRAWS, 1)) / freedom)
-    root = np.linalg.inv(np.linalg.qr(scaled, mode="r"))  # root root^T = (X^T X)^-1
-    drawn = (solution + math.sqrt(squares / freedom) * noise @ root.T) / size
+    own: np.ndarray = np.linalg.cholesky(scaled.T @ (scaled * weights[:, None] ** 2))
+    root = np.linalg.inv(scaled.T @ scaled) @ own  # root root^T = A X^T W^4 X A,  A = (X^T W^2 X)^-1
+    drawn = (solution + math.sqrt(variance) * noise @ root.T) / size
     return np.sort(_top(drawn[:, 0], drawn[:, 1]) ** 2)
 
 

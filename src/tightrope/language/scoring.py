@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from tightrope.language import lora
 from tightrope.language.answers import Fault, RewardError
 from tightrope.language.collect import Experience
 from tightrope.language.data import Prompt
@@ -116,13 +117,12 @@ def with_model(found: Scores | None, learnt: np.ndarray) -> Scores:
 
 def is_folder(reward: Any) -> bool:
     """Whether a reward, or one of several, is the folder of a reward model."""
-    entries = reward if isinstance(reward, list) else [reward]
-    return any(isinstance(entry, str | Path) and Path(entry).is_dir() for entry in entries)
+    return any(isinstance(entry, str | Path) and Path(entry).is_dir() for entry in _entries(reward))
 
 
 def reward_adapter(words: Any) -> Path | None:
     """The adapter folder of a reward model that was trained with LoRA, None for any other reward."""
-    for entry in words if isinstance(words, list) else [words]:
+    for entry in _entries(words):
         if isinstance(entry, str | Path) and (Path(entry) / "adapter" / "adapter_config.json").is_file():
             return Path(entry) / "adapter"
     return None
@@ -143,10 +143,9 @@ def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: flo
 
     ``on_trunk``: the folder of the adapter that `make_roles` has put on the trunk.
     """
-    entries = list(reward) if isinstance(reward, list) else [reward]
     functions: list[Any] = []
     model, adapter = None, None
-    for entry in entries:
+    for entry in _entries(reward):
         if isinstance(entry, str | Path) and Path(entry).is_dir():
             if model is not None or adapter is not None:
                 raise ValueError("Two reward models were given; expected one, and any number of functions.")
@@ -188,8 +187,40 @@ def _same_tokens(model: RewardModel, roles: Roles, folder: Any) -> None:
         )
 
 
-def value_head_from(adapter: tuple[Tensor, float], head: nn.Linear) -> None:
-    """Begin a critic with a reward head: V = score at first."""
+def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
+    """Begin the critic with a reward model's weights: V = score at first.
+
+    An adapter takes the reward model's adapter, a critic of its own the whole reward model; a head on the
+    policy's hidden states cannot read what the reward model's hidden states say. ValueError for what does not
+    fit.
+    """
+    folder = next((entry for entry in _entries(reward) if is_folder(entry)), None)
+    kind, head = roles.settings.critic, roles.critic_head
+    if folder is None or head is None or kind == "head" or (kind == "adapter" and judge.adapter is None):
+        raise ValueError(
+            f"critic_from_reward with critic {kind!r}: expected the folder of a reward model as reward and "
+            "critic separate, or critic adapter with a reward adapter on the very model that is aligned "
+            "(tightrope reward --tune lora). Choose one, or leave critic_from_reward out."
+        )
+    if kind == "adapter" and judge.adapter is not None:
+        weight, shift = judge.adapter
+        state = lora.adapter_state(roles.model, "reward")
+        lora.load_adapter_state(roles.model, "critic", state)
+    else:
+        assert roles.critic is not None
+        model = judge.model or load_reward(folder)
+        weight, shift = model.head.weight, model.shift
+        try:
+            roles.critic.parts.base.load_state_dict(model.base.state_dict())
+        except RuntimeError as error:
+            raise ValueError(
+                f"critic_from_reward: the reward model {folder} is built otherwise than the critic, which is "
+                f"made of {roles.settings.model} ({str(error).splitlines()[-1].strip()}). Leave it out."
+            ) from error
     with torch.no_grad():
-        head.weight.copy_(adapter[0])
-        head.bias.fill_(-adapter[1])
+        head.weight.copy_(weight)
+        head.bias.fill_(-shift)
+
+
+def _entries(reward: Any) -> list[Any]:
+    return list(reward) if isinstance(reward, list) else [reward]

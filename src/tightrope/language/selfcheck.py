@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,18 +18,10 @@ from tightrope.language.rewards import Scores
 from tightrope.language.roles import Roles, make_roles
 from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.language.trainer import LOG_RATIO_LIMIT
+from tightrope.runs.findings import Finding
 
 WORDS = ("The", "Once upon a time there was", "I think that", "a b c d e f g h")
 GRADIENT_LIMIT = 1e-3  # relative, of the norm: float32 sums in another order
-
-
-class Finding(NamedTuple):
-    """One thing that was looked at: what, whether it is as it should be, what was seen, what to do if not."""
-
-    what: str
-    good: bool
-    seen: str
-    advice: str = ""
 
 
 def check_model(model: str, dtype: str = "float32") -> list[Finding]:

@@ -166,6 +166,9 @@ class AlignSettings(ModelSettings):
     evaluate_every: float | None = setting(
         0.05, "Fraction of the run between gold scores on held-out prompts.", above=0, at_most=1
     )
+    held_out_prompts: int = setting(
+        64, "Prompts kept for the gold score, a quarter of all at most; more of them, less noise.", at_least=1
+    )
 
     def __post_init__(self) -> None:
         """Check ranges, and the settings that must fit each other."""

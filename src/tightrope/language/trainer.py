@@ -17,7 +17,6 @@ from torch import Tensor
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.algorithms.optimise import SamplingMismatch, make_optimiser, set_learning_rates
-from tightrope.language import lora
 from tightrope.language.collect import PromptOrder, describe, gather, rewards_of, to_batch
 from tightrope.language.data import Prompt, read_prompts, read_rows
 from tightrope.language.fitting import Reporter
@@ -31,18 +30,17 @@ from tightrope.language.samples import sample_rows
 from tightrope.language.saving import save_model, save_state
 from tightrope.language.scoring import (
     Judge,
+    critic_from_reward,
     is_folder,
     make_judge,
     reward_adapter,
     shares_trunk,
-    value_head_from,
 )
 from tightrope.language.settings import AlignSettings
 from tightrope.maths.values import explained_variance
 from tightrope.runs.run import Run
 
 LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
-HELD_OUT_PROMPTS = 64
 
 
 @dataclass(frozen=True)
@@ -85,10 +83,10 @@ class Trainer:
         self.gold: Judge | None = None
         if gold is not None:
             self.gold = make_judge(gold, self.roles, on_trunk=None, timeout=settings.reward_timeout)
-            count = min(HELD_OUT_PROMPTS, len(self.prompts) // 4)
+            count = min(settings.held_out_prompts, len(self.prompts) // 4)
             self.prompts, self.held_out = self.prompts[: len(self.prompts) - count], self.prompts[-count:]
-        if settings.critic_from_reward and self.roles.critic_head is not None:
-            self._critic_from_reward()
+        if settings.critic_from_reward:
+            critic_from_reward(self.judge, self.roles, reward)
         self.optimiser = make_optimiser(
             self.roles.parameters(), self.roles.critic_parameters(), settings.update
         )
@@ -115,19 +113,6 @@ class Trainer:
 
     def _warn(self, text: str) -> None:
         self.report("line", {"text": f"warning: {text}", "warning": True})
-
-    def _critic_from_reward(self) -> None:
-        if self.judge.adapter is None:
-            raise ValueError(
-                "critic_from_reward needs a reward model that was trained with --tune lora from the model "
-                "that is aligned, and --tune lora here. Leave it out, or train such a one."
-            )
-        assert self.roles.critic_head is not None
-        value_head_from(self.judge.adapter, self.roles.critic_head)
-        if self.settings.critic == "adapter":
-            lora.load_adapter_state(
-                self.roles.model, "critic", lora.adapter_state(self.roles.model, "reward")
-            )
 
     # ------------------------------------------------------------------------------------------ the loop
 

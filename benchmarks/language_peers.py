@@ -1,6 +1,6 @@
-"""The peer's side of rlhf.py: PPO by TRL 1.12's trl.experimental.ppo, in the peer's own interpreter.
+"""The peer's side of language.py: PPO by TRL 1.12's trl.experimental.ppo, in the peer's own interpreter.
 
-    python rlhf_peers.py '{"folder": ..., "batch": 64, "tokens": 24, "iterations": 4}' RESULT.json
+    python language_peers.py '{"folder": ..., "batch": 64, "tokens": 24, "iterations": 4}' RESULT.json
 
 This file imports nothing of tightrope. TRL removed PPO in 1.13.
 """
