@@ -38,8 +38,9 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
             "tune": "full",
         },
         "align": {
-            "total_episodes": 10_240, "batch_size": 128, "minibatch_size": 32, "learning_rate": 2e-3,
-            "kl_beta": 0.1, "kl_goal": 13.0, "kl_horizon": 2500.0, "lora_rank": 32, "lora_layers": 2,
+            "total_episodes": 12_288, "batch_size": 128, "minibatch_size": 32, "learning_rate": 1e-3,
+            "kl": "exact-split", "kl_beta": 0.1, "kl_goal": 11.0, "kl_horizon": 2500.0, "lora_rank": 32,
+            "lora_layers": 2, "evaluate_every": 0.025, "held_out_prompts": 256,
         },
     },
     "smollm2": {
@@ -58,6 +59,7 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
 }  # fmt: skip
+JUDGED = 512  # responses before and after
 RESPONSES = {"max_new_tokens": 24, "max_prompt_tokens": 24, "ignore_eos": True, "critic_learning_rate": 1e-2}
 
 
@@ -127,7 +129,10 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--out", type=Path, help="folder for the three runs (default runs/sentiment-...)")
     parser.add_argument("--model", choices=tuple(STAGES), default="glassllm")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--kl-beta", type=float, help="weight of the KL; 0 shows reward hacking")
+    parser.add_argument("--kl-beta", type=float, help="a fixed weight of the KL; 0 shows reward hacking")
+    parser.add_argument("--critic", choices=("head", "adapter", "separate"), default="head")
+    parser.add_argument("--episodes", type=int, help="responses to train on")
+    parser.add_argument("--threads", type=int, help="CPU threads of PPO (default: every core)")
     parser.add_argument(
         "--stages", type=Path, help="folder of an earlier run whose SFT and reward model are used"
     )
@@ -145,11 +150,15 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     stages = STAGES[options.model]
     model = _sft(earlier, for_reward, options.model, stages["sft"])
     reward = _reward(earlier, model, for_reward, stages["reward"])
-    values = {**RESPONSES, **stages["align"], "seed": options.seed}
+    values = {**RESPONSES, **stages["align"], "seed": options.seed, "critic": options.critic}
+    values |= {"threads": options.threads} | (
+        {"total_episodes": options.episodes} if options.episodes else {}
+    )
     if options.kl_beta is not None:
         values |= {"kl_beta": options.kl_beta, "kl_goal": None}
-    run, seconds = _align(values, model, reward, gold, out, openings(for_prompts, 4000))
-    return _summary(options, run, seconds, gold)
+    kept = len(for_prompts) // 5  # reviews whose beginnings PPO never sees
+    run, seconds, alarms = _align(values, model, reward, gold, out, openings(for_prompts[kept:], 4000))
+    return _summary(options, run, seconds, alarms, gold, openings(for_prompts[:kept], JUDGED))
 
 
 def _display(columns: Any, what: str) -> Any:
@@ -192,20 +201,31 @@ def _reward(out: Path, model: str, rows: list[tuple[str, int]], values: dict[str
 
 def _align(
     values: dict[str, Any], model: str, reward: str, gold: Any, out: Path, prompts: list[str]
-) -> tuple[Any, float]:
-    """Stage three: PPO."""
+) -> tuple[Any, float, list[dict[str, Any]]]:
+    """Stage three: PPO. Also returns the warnings it gave, and after how many responses."""
     from tightrope.language.align import align
     from tightrope.language.display import ALIGN
 
     print("\n3. PPO towards what the reward model prefers, held near the reference by the KL")
-    begin = time.perf_counter()
+    begin, alarms, step = time.perf_counter(), list[dict[str, Any]](), 0
+
     with _display(ALIGN, "responses") as display:
+
+        def report(event: str, data: dict[str, Any]) -> None:
+            nonlocal step
+            step = data.get("step", step)
+            if data.get("warning"):
+                alarms.append({"after": step, "text": data["text"]})
+            display(event, data)
+
         run = align(model=model, prompts=prompts, reward=reward, gold=gold, run_dir=out / "align",
-                    report=display, **values)  # fmt: skip
-    return run, time.perf_counter() - begin
+                    report=report, **values)  # fmt: skip
+    return run, time.perf_counter() - begin, alarms
 
 
-def _summary(options: Any, run: Any, seconds: float, gold: Any) -> dict[str, Any]:
+def _summary(
+    options: Any, run: Any, seconds: float, alarms: list[dict[str, Any]], gold: Any, prompts: list[str]
+) -> dict[str, Any]:
     from tightrope import panel
     from tightrope.language.evaluate import sample_run
     from tightrope.language.samples import print_comparison
@@ -217,7 +237,7 @@ def _summary(options: Any, run: Any, seconds: float, gold: Any) -> dict[str, Any
         ("KL to the reference, nats a response", "objective/kl"),
     ):
         print(f"\n{title}", *panel.curve([(row["episodes"], row[name]) for row in curve]), sep="\n")
-    compared = sample_run(run.path, count=256, seed=99)
+    compared = sample_run(run.path, prompts, seed=99)
     before, after = (
         gold([row["prompt"] for row in compared], [row[which] for row in compared])
         for which in ("before", "after")
@@ -225,10 +245,13 @@ def _summary(options: Any, run: Any, seconds: float, gold: Any) -> dict[str, Any
     print()
     print_comparison(compared[:6])
     settings = json.loads((run.path / "settings.json").read_text(encoding="utf-8"))
+    last = curve[-4:]  # a batch alone is too few responses for a mean KL
     result = {
-        "seed": options.seed, "kl_beta": settings["kl_beta"],
+        "model": options.model, "seed": options.seed, "critic": options.critic,
+        "kl_beta": settings["kl_beta"], "kl_goal": settings["kl_goal"],
         "gold_before": sum(before) / len(before), "gold_after": sum(after) / len(after),
-        "kl": curve[-1]["objective/kl"], "ppo_seconds": seconds, "curve": curve,
+        **{name: sum(row[f"objective/{name}"] for row in last) / len(last) for name in ("kl", "scores")},
+        "ppo_seconds": seconds, "threads": options.threads, "warnings": alarms, "curve": curve,
     }  # fmt: skip
     gained = f"{result['gold_before']:.2f} before, {result['gold_after']:.2f} after"
     print(f"\ngold judge: P(positive) {gained}, at a KL of {result['kl']:.1f} nats a response")
