@@ -110,33 +110,46 @@ def make_reward(name: str, folder: str, full: bool, out: Path) -> str:
     return str(out)
 
 
-def compare(name: str, layout: str, peer_python: str | None, pairs: int, rewards: Path) -> dict[str, Any]:
-    """One layout of one model beside the peer."""
+def compare(
+    name: str, layouts: list[str], peer_python: str | None, pairs: int, rewards: Path
+) -> list[dict[str, Any]]:
+    """The layouts of one model beside the peer: in every pair the peer runs once, each layout once."""
     from tightrope.language.models import find_model
 
-    shape, folder, values = MODELS[name], find_model(name), values_of(name, layout)
-    reward = make_reward(name, folder, values["tune"] == "full", rewards / f"{name}-{layout}")
+    shape, folder = MODELS[name], find_model(name)
     job = {"folder": folder, "batch": shape["batch"], "tokens": TOKENS, "threads": 2}
-    mine = job | {"values": values, "reward": reward}
-    contenders = {"tightrope": ([sys.executable, __file__, "ours"], mine, shape["ours"], our_environment())}
+    contenders: dict[str, Any] = {}
     if peer_python:
         script = [peer_python, str(HERE / "language_peers.py")]
         contenders["trl"] = (script, job, shape["peer"], plain_environment())
+    for layout in layouts:
+        values = values_of(name, layout)
+        full = values["tune"] == "full"
+        reward = make_reward(name, folder, full, rewards / f"{name}-{layout}")
+        between = shape["peer"] if full else shape["ours"]  # every weight takes about as long as the peer
+        mine = job | {"values": values, "reward": reward}
+        contenders[layout] = ([sys.executable, __file__, "ours"], mine, between, our_environment())
     taken: list[dict[str, Any]] = []
     for k in range(pairs):
         order = list(contenders) if k % 2 == 0 else list(reversed(contenders))
         taken.append({who: rate(*contenders[who]) for who in order})
         rates = ", ".join(f"{who} {taken[-1][who]['rate']:,.1f}" for who in contenders)
-        print(f"{name}, {layout}, pair {k + 1} of {pairs}: {rates} tokens/s", file=sys.stderr, flush=True)
-    entry: dict[str, Any] = {"model": name, "layout": layout, "values": values, "batch": shape["batch"]}
-    entry["pairs"] = taken
-    for who in contenders:
-        entry[who] = statistics.median(pair[who]["rate"] for pair in taken)
-        entry[f"{who}_memory_mb"] = max(pair[who]["memory_mb"] for pair in taken)
-    if "trl" in contenders:
-        ratios = [pair["tightrope"]["rate"] / pair["trl"]["rate"] for pair in taken]
-        entry["ratio"] = {"median": statistics.median(ratios), "low": min(ratios), "high": max(ratios)}
-    return entry
+        print(f"{name}, pair {k + 1} of {pairs}: {rates} tokens/s", file=sys.stderr, flush=True)
+    return [_row(name, layout, contenders[layout][1]["values"], taken) for layout in layouts]
+
+
+def _row(name: str, layout: str, values: dict[str, Any], taken: list[dict[str, Any]]) -> dict[str, Any]:
+    who = {"tightrope": layout, **({"trl": "trl"} if "trl" in taken[0] else {})}
+    pairs = [{one: pair[theirs] for one, theirs in who.items()} for pair in taken]
+    row: dict[str, Any] = {"model": name, "layout": layout, "values": values, "batch": MODELS[name]["batch"]}
+    row["pairs"] = pairs
+    for one in who:
+        row[one] = statistics.median(pair[one]["rate"] for pair in pairs)
+        row[f"{one}_memory_mb"] = max(pair[one]["memory_mb"] for pair in pairs)
+    if "trl" in who:
+        ratios = [pair["tightrope"]["rate"] / pair["trl"]["rate"] for pair in pairs]
+        row["ratio"] = {"median": statistics.median(ratios), "low": min(ratios), "high": max(ratios)}
+    return row
 
 
 def text(results: dict[str, Any]) -> str:
@@ -213,12 +226,12 @@ def measure(options: argparse.Namespace, words: list[str]) -> None:
             results["peer"] = json.loads(Path(f"{folder}/versions.json").read_text())
     with tempfile.TemporaryDirectory() as folder:
         for name in options.models:
-            for layout in options.layouts:
-                row = compare(name, layout, options.peer_python, options.pairs, Path(folder))
-                kept = [r for r in results["rows"] if (r["model"], r["layout"]) != (name, layout)]
-                results["rows"] = [*kept, row]
-                options.results.parent.mkdir(parents=True, exist_ok=True)
-                options.results.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+            rows = compare(name, options.layouts, options.peer_python, options.pairs, Path(folder))
+            fresh = {(row["model"], row["layout"]) for row in rows}
+            kept = [row for row in results["rows"] if (row["model"], row["layout"]) not in fresh]
+            results["rows"] = kept + rows
+            options.results.parent.mkdir(parents=True, exist_ok=True)
+            options.results.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
