@@ -34,7 +34,7 @@ sys.path.insert(0, str(HERE.parent / "demos"))
 from sentiment import STAGES
 
 RESULTS = HERE / "results" / "language" / "speed.json"
-PAGE = HERE.parent / "docs" / "benchmarks.md"
+PAGE, README = HERE.parent / "docs" / "benchmarks.md", HERE.parent / "README.md"
 TOKENS = 24
 # model -> batch of responses, iterations n1 and n2 of the peer and of ours
 MODELS: dict[str, dict[str, Any]] = {
@@ -179,10 +179,24 @@ def text(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def short_text(results: dict[str, Any]) -> str:
+    """The README's table."""
+    lines = ["| model | layout | tightrope | TRL 1.12 (ratio) | peak memory |", "|---|---|---|---|---|"]
+    for row in results["rows"]:
+        own, memory = f"**{row['tightrope']:,.0f}**", f"{row['tightrope_memory_mb']:,.0f} MB"
+        peer = "-"
+        if "trl" in row:
+            peer = f"{row['trl']:,.0f} ({row['ratio']['median']:.1f})"
+            memory += f" beside {row['trl_memory_mb']:,.0f} MB"
+        lines.append(f"| {row['model']} | {row['layout']} | {own} | {peer} | {memory} |")
+    where = f"{results['machine']['cpu']}, {results['machine']['cores']} cores, {results['date']}"
+    return "\n".join([*lines, "", f"Response tokens/s, medians; {where}."])
+
+
 def render(results: dict[str, Any]) -> None:
-    """The table into docs/benchmarks.md."""
-    page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(fill(page, "language", text(results)), encoding="utf-8")
+    """The tables into docs/benchmarks.md and the README."""
+    for page, name, body in ((PAGE, "language", text), (README, "readme-language", short_text)):
+        page.write_text(fill(page.read_text(encoding="utf-8"), name, body(results)), encoding="utf-8")
 
 
 def main(words: list[str] | None = None) -> None:

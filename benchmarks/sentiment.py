@@ -26,7 +26,7 @@ from speed_report import fill
 from speed_runs import HERE, our_environment
 
 RESULTS = HERE / "results" / "language" / "sentiment.json"
-PAGE = HERE.parent / "docs" / "benchmarks.md"
+PAGE, README = HERE.parent / "docs" / "benchmarks.md", HERE.parent / "README.md"
 DEMO = HERE.parent / "demos" / "sentiment.py"
 SEEDS = (21, 22, 23, 24, 25)
 CRITICS = ("head", "adapter", "separate")
@@ -34,6 +34,7 @@ SHORT = 4096  # responses of a run that compares critics
 JOBS: dict[str, tuple[str, ...]] = {
     **{f"seed-{seed}": ("--seed", str(seed)) for seed in SEEDS},
     **{f"beta-{beta:g}": ("--seed", "26", "--kl-beta", str(beta)) for beta in (0.0, 0.02, 0.2)},
+    "smollm2": ("--seed", "21", "--model", "smollm2"),
     **{
         f"critic-{critic}-{seed}": ("--seed", str(seed), "--critic", critic, "--episodes", str(SHORT))
         for seed in SEEDS
@@ -47,7 +48,8 @@ def run(folder: Path, name: str) -> None:
     result = folder / f"{name}.json"
     if result.exists():
         return
-    command = [sys.executable, str(DEMO), "--stages", str(folder / "stages"), "--out", str(folder / name)]
+    stages = folder / ("stages-smollm2" if name == "smollm2" else "stages")
+    command = [sys.executable, str(DEMO), "--stages", str(stages), "--out", str(folder / name)]
     command += ["--threads", "1", "--json", str(result), *JOBS[name]]
     with open(folder / f"{name}.log", "w", encoding="utf-8") as log:
         subprocess.run(command, env=our_environment() | {"OMP_NUM_THREADS": "1"}, stdout=log, check=True)
@@ -83,7 +85,7 @@ def text(results: dict[str, Any]) -> str:
             continue
         held = f"KL towards {found['kl_goal']:g}" if found["kl_goal"] else f"kl_beta {found['kl_beta']:g}"
         lines.append(
-            f"| seed {found['seed']}, {held} | {found['gold_before']:.2f} | **{found['gold_after']:.2f}** | "
+            f"| {found['model']}, seed {found['seed']}, {held} | {found['gold_before']:.2f} | **{found['gold_after']:.2f}** | "
             f"{found['scores']:.2f} | {found['kl']:.1f} | {found['curve'][-1]['objective/distinct_2']:.2f} | "
             f"{found['ppo_seconds']:.0f} |"
         )
@@ -149,11 +151,30 @@ def main() -> None:
     print(text(results), critics(results), sep="\n\n")
 
 
+def sentence(results: dict[str, Any]) -> str:
+    """What the README says of the runs."""
+    held = [found for name, found in results["runs"].items() if name.startswith("seed-")]
+    before, after = (statistics.mean(found[f"gold_{when}"] for found in held) for when in ("before", "after"))
+    slowest = max(found["ppo_seconds"] for found in held)
+    lines = [
+        f"glassllm (0.85 M parameters), {len(held)} seeds: a gold judge that PPO never sees goes from "
+        f"{before:.2f} to **{after:.2f}** in P(positive), at {results['kl_mean']:.1f} nats a response; PPO "
+        f"takes {slowest:.0f} s on one core at most."
+    ]
+    real = results["runs"].get("smollm2")
+    if real:
+        lines.append(
+            f"SmolLM2-135M: from {real['gold_before']:.2f} to **{real['gold_after']:.2f}** at "
+            f"{real['kl']:.1f} nats, after {real['ppo_seconds'] / 60:.0f} minutes of PPO."
+        )
+    return "\n".join(lines)
+
+
 def render(results: dict[str, Any]) -> None:
-    """The table into docs/benchmarks.md."""
-    page = PAGE.read_text(encoding="utf-8")
-    page = fill(page, "sentiment", text(results))
-    PAGE.write_text(fill(page, "critics", critics(results)), encoding="utf-8")
+    """The tables into docs/benchmarks.md, the sentence into the README."""
+    blocks = ((PAGE, "sentiment", text), (PAGE, "critics", critics), (README, "readme-sentiment", sentence))
+    for page, name, body in blocks:
+        page.write_text(fill(page.read_text(encoding="utf-8"), name, body(results)), encoding="utf-8")
 
 
 if __name__ == "__main__":

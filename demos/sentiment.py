@@ -54,8 +54,8 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
         },
         "align": {
             "total_episodes": 4096, "batch_size": 64, "minibatch_size": 16, "learning_rate": 5e-4,
-            "kl_beta": 0.1, "kl_goal": 13.0, "kl_horizon": 1000.0, "lora_rank": 16, "lora_layers": 10,
-            "dtype": "bfloat16",
+            "kl_beta": 0.05, "lora_rank": 16, "lora_layers": 10, "dtype": "bfloat16",
+            "evaluate_every": 0.1, "held_out_prompts": 48,
         },
     },
 }  # fmt: skip
