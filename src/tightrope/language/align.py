@@ -66,7 +66,9 @@ def _named(prompts: Any, reward: Any) -> dict[str, str]:
     for name, value in (("data", prompts), ("reward", reward)):
         if value is not None:
             found[name] = (
-                value if isinstance(value, str) else getattr(value, "__name__", f"<{type(value).__name__}>")
+                str(value)
+                if isinstance(value, str | Path)
+                else getattr(value, "__name__", f"<{type(value).__name__}>")
             )
     return found
 

@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -218,3 +218,10 @@ def context_length(model: Any) -> int | None:
         if (found := getattr(model.config, name, None)) is not None:
             return int(found)
     return None
+
+
+def parameter_counts(model: Any, trained: Iterable[nn.Parameter]) -> tuple[int, int]:
+    """How many numbers are trained, and how many there are, the model's and those trained beside it."""
+    trained = list(trained)
+    every = {id(parameter): parameter for parameter in (*model.parameters(), *trained)}
+    return sum(p.numel() for p in trained), sum(p.numel() for p in every.values())

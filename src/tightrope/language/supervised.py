@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 from torch import nn
 
 from tightrope.language.fitting import Loaded, Reporter
+from tightrope.language.models import parameter_counts
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.run import Run
 
@@ -62,8 +63,7 @@ def announcement(
     settings: SupervisedSettings, loaded: Loaded, parameters: Sequence[nn.Parameter], data: str
 ) -> list[str]:
     """Two lines in words: the model and the data."""
-    trained = sum(parameter.numel() for parameter in parameters)
-    total = sum(parameter.numel() for parameter in loaded.model.parameters())
+    trained, total = parameter_counts(loaded.model, parameters)
     return [
         f"model: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained",
         f"data: {data}",

@@ -21,7 +21,7 @@ from tightrope.language.collect import PromptOrder, describe, gather, rewards_of
 from tightrope.language.data import Prompt, read_prompts, read_rows
 from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
-from tightrope.language.models import context_length, find_model
+from tightrope.language.models import context_length, find_model, parameter_counts
 from tightrope.language.monitor import Monitor
 from tightrope.language.policy_model import PolicyModel
 from tightrope.language.ptx import Pretraining
@@ -164,8 +164,7 @@ class Trainer:
 
     def _lines(self) -> list[str]:
         settings, trunk = self.settings, self.roles.trunk
-        trained = sum(parameter.numel() for parameter in self.roles.parameters())
-        total = sum(parameter.numel() for parameter in self.roles.model.parameters())
+        trained, total = parameter_counts(self.roles.model, self.roles.parameters())
         shared = (
             f"; {trunk.cut} of {len(trunk.parts.layers)} layers computed once for all roles"
             if trunk.cut
