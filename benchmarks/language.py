@@ -193,9 +193,12 @@ def short_text(results: dict[str, Any]) -> str:
     return "\n".join([*lines, "", f"Response tokens/s, medians; {where}."])
 
 
+BLOCKS = ((PAGE, "language", text), (README, "readme-language", short_text))
+
+
 def render(results: dict[str, Any]) -> None:
     """The tables into docs/benchmarks.md and the README."""
-    for page, name, body in ((PAGE, "language", text), (README, "readme-language", short_text)):
+    for page, name, body in BLOCKS:
         page.write_text(fill(page.read_text(encoding="utf-8"), name, body(results)), encoding="utf-8")
 
 

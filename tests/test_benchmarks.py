@@ -13,8 +13,9 @@ ROOT = Path(__file__).resolve().parents[1]
 BENCHMARKS = ROOT / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import film_reviews  # noqa: E402
+import language  # noqa: E402
 import scaling  # noqa: E402
-import sentiment  # noqa: E402
 import speed  # noqa: E402
 import speed_peers  # noqa: E402
 import speed_report as report  # noqa: E402
@@ -166,14 +167,32 @@ def test_the_page_holds_the_committed_figures(tmp_path: Path):
         assert copy.read_text(encoding="utf-8") == text, "run: python benchmarks/speed.py --render"
 
 
-def test_the_page_shows_the_committed_sentiment_runs():
-    if not sentiment.RESULTS.exists():
-        pytest.skip("no results are committed yet")
-    results = json.loads(sentiment.RESULTS.read_text(encoding="utf-8"))
-    page = sentiment.PAGE.read_text(encoding="utf-8")
-    assert report.fill(page, "sentiment", sentiment.text(results)) == page, (
-        "run: python benchmarks/sentiment.py"
-    )
+BLOCKS = [
+    *[(film_reviews, *block) for block in film_reviews.BLOCKS],
+    *[(language, *block) for block in language.BLOCKS],
+]
+
+
+@pytest.mark.parametrize("benchmark, page, name, body", BLOCKS, ids=[block[2] for block in BLOCKS])
+def test_pages_of_the_language_story_show_the_committed_results(benchmark, page, name, body):
+    results = json.loads(benchmark.RESULTS.read_text(encoding="utf-8"))
+    text = page.read_text(encoding="utf-8")
+    assert report.fill(text, name, body(results)) == text, f"render {benchmark.__name__}.py again"
+
+
+def test_the_language_benchmark_runs_the_settings_of_the_demo():
+    """What is timed is what reached the quality that is claimed."""
+    for name in language.MODELS:
+        present = language.STAGES[name]["align"]
+        timed = language.values_of(name, "one trunk")
+        assert timed["lora_layers"] == present["lora_layers"] and timed["lora_rank"] == present["lora_rank"]
+        assert timed.get("kl") == present.get("kl") and timed["dtype"] == "float32"
+    assert language.values_of("glassllm", "full")["critic"] == "separate"
+
+
+def test_an_interval_is_students():
+    """1, 2, 3: mean 2, deviation 1, t = 4.303 on two degrees of freedom."""
+    assert film_reviews.interval([1.0, 2.0, 3.0], 2) == "2.00 ± 2.48"
 
 
 def test_committed_results_are_whole_runs():

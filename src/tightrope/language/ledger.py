@@ -25,7 +25,7 @@ from tightrope.language.token_stats import CHUNK
 Phase = Literal["always", "rollout", "update"]
 SHARE = 0.9  # of the available memory that a job may claim
 FLOAT = 4  # bytes of a float32: adapters, heads, numbers per step
-LOGIT_COPIES = 9  # [chunk, vocabulary] at once in token_stats: logits, p, log p of two models, gradients
+LOGIT_COPIES = 6  # [chunk, vocabulary] at once in token_stats: p and log p of two models, gradients
 DRAW_BYTES = 28  # per row and word while a token is drawn: logits twice, log p; p and its sum in float64
 
 

@@ -1,7 +1,7 @@
 """The three stages on film reviews over several seeds: does the gold judge follow, and what without a KL?
 
-    python benchmarks/sentiment.py                    # an hour, two runs at a time with a thread each
-    python benchmarks/sentiment.py --collect FOLDER   # the tables of runs that are there
+    python benchmarks/film_reviews.py                    # an hour, two runs at a time with a thread each
+    python benchmarks/film_reviews.py --collect FOLDER   # the tables of runs that are there
 
 One SFT model and one reward model; PPO from them with each seed; once without a KL, once each with weights
 of the KL that stay as they are; and a third as long with each kind of critic. The gold judge has read other
@@ -25,7 +25,7 @@ from speed import machine
 from speed_report import fill
 from speed_runs import HERE, our_environment
 
-RESULTS = HERE / "results" / "language" / "sentiment.json"
+RESULTS = HERE / "results" / "language" / "film_reviews.json"
 PAGE, README = HERE.parent / "docs" / "benchmarks.md", HERE.parent / "README.md"
 DEMO = HERE.parent / "demos" / "sentiment.py"
 SEEDS = (31, 32, 33, 34, 35)
@@ -66,7 +66,7 @@ def collect(folder: Path) -> dict[str, Any]:
     gained = [found["gold_after"] - found["gold_before"] for found in held]
     return {
         "date": datetime.date.today().isoformat(),
-        "command": "python benchmarks/sentiment.py",
+        "command": "python benchmarks/film_reviews.py",
         "machine": machine(),
         "gain_mean": statistics.mean(gained),
         "gain_worst": min(gained),
@@ -171,10 +171,16 @@ def sentence(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+BLOCKS = (
+    (PAGE, "film-reviews", text),
+    (PAGE, "critics", critics),
+    (README, "readme-film-reviews", sentence),
+)
+
+
 def render(results: dict[str, Any]) -> None:
     """The tables into docs/benchmarks.md, the sentence into the README."""
-    blocks = ((PAGE, "sentiment", text), (PAGE, "critics", critics), (README, "readme-sentiment", sentence))
-    for page, name, body in blocks:
+    for page, name, body in BLOCKS:
         page.write_text(fill(page.read_text(encoding="utf-8"), name, body(results)), encoding="utf-8")
 
 
