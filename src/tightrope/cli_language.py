@@ -147,8 +147,15 @@ def sample(words: list[str]) -> int:
         "--count", type=int, metavar="N", help="How many prompts of the run's data (default 8)."
     )
     group.add_argument("--seed", type=int, metavar="N", help="Seed of sampling (default: the run's + 1).")
+    group.add_argument(
+        "--recorded",
+        action="store_true",
+        help="Sample nothing: show the last responses of training with their rewards, KL and advantage.",
+    )
     output(parser)
     given = parser.read(words)
+    if given.get("recorded"):
+        return _recorded(given)
     _require_transformers()
     from tightrope.language.evaluate import sample_run
 
@@ -159,6 +166,23 @@ def sample(words: list[str]) -> int:
         from tightrope.language.samples import print_comparison
 
         print_comparison(rows)
+    return 0
+
+
+def _recorded(given: dict[str, Any]) -> int:
+    """The newest rollout in samples.jsonl, from the best score to the worst."""
+    from tightrope.language.samples import print_samples, read_samples, spread
+
+    for option in ("prompt", "seed"):
+        if option in given:
+            raise UsageError(f"--recorded samples nothing, so that --{option} has no meaning. Leave one out.")
+    rows = read_samples(given["run"])
+    newest = [row for row in rows if row["step"] == rows[-1]["step"]]
+    shown = spread(newest, given.get("count", 8))
+    if given.get("json"):
+        print_json({"samples": shown})
+    else:
+        print_samples(shown, title=f"after {rows[-1]['step']:,} responses" if rows else "")
     return 0
 
 

@@ -236,10 +236,20 @@ def test_the_commands(folder, tmp_path, capsys):
     run = tmp_path / "run"
     reward = f"{tmp_path / 'mine.py'}:score"
     assert main(["align", *words, "--reward", reward, "--run-dir", str(run), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert summary["episodes"] == 32
+    seen = capsys.readouterr()
+    assert json.loads(seen.out.splitlines()[-1])["episodes"] == 32
+    assert "after 16 responses" in seen.err and "advantage" in seen.err  # a table at every checkpoint
     assert main(["sample", str(run), "--count", "2"]) == 0
     assert "before" in capsys.readouterr().out
+    assert main(["sample", str(run), "--recorded", "--count", "3"]) == 0
+    shown = capsys.readouterr().out
+    assert "after 32 responses" in shown and "advantage" in shown and "score" in shown
+    assert main(["sample", str(run), "--recorded", "--json"]) == 0
+    recorded = json.loads(capsys.readouterr().out)["samples"]
+    assert len(recorded) == 8 and {row["step"] for row in recorded} == {32}
+    assert [row["score"] for row in recorded] == sorted((row["score"] for row in recorded), reverse=True)
+    assert main(["sample", str(run), "--recorded", "--seed", "1"]) == 2
+    capsys.readouterr()
     assert main(["resume", str(run), "--total-steps", "48"]) == 2
     assert "--reward" in capsys.readouterr().err
     assert main(["resume", str(run), "--total-steps", "48", "--reward", reward, "--json"]) == 0

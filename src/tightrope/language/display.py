@@ -10,6 +10,9 @@ import time
 from types import TracebackType
 from typing import Any, NamedTuple, TextIO
 
+from tightrope.language.samples import print_samples, spread
+
+SAMPLES = 3  # responses of a table: the best score, the middle and the worst
 ROWS = 20  # lines of a run that is not watched on a terminal
 
 
@@ -76,6 +79,10 @@ class Display:
                 self._say(text)
         elif event == "update":
             self._update(data)
+        elif event == "samples" and not self._quiet:
+            rows, title = spread(data["rows"], SAMPLES), f"after {data['step']:,} responses"
+            console = None if self._bar is None else self._bar.console
+            print_samples(rows, self._stream, title=title, console=console)
 
     def _update(self, data: dict[str, Any]) -> None:
         self.step, self.total = int(data["step"]), int(data.get("total_steps", 0))

@@ -93,12 +93,18 @@ def spread(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
 
 
 def print_samples(
-    rows: Sequence[dict[str, Any]], stream: TextIO | None = None, *, width: int | None = None, title: str = ""
+    rows: Sequence[dict[str, Any]],
+    stream: TextIO | None = None,
+    *,
+    width: int | None = None,
+    title: str = "",
+    console: Any = None,
 ) -> None:
     """A table of prompt, response, each function's score, their sum where there are several, KL, advantage.
 
-    ``stream``: stdout by default; ``width``: characters, by default the terminal's. Control characters that
-    a model may write do not reach the terminal.
+    ``stream``: stdout by default; ``width``: characters, by default the terminal's; ``console``: rich's, in
+    their place, where a progress bar owns the terminal. Control characters that a model may write do not
+    reach the terminal.
     """
     names = list(dict.fromkeys(name for row in rows for name in row["scores"]))
     heads = [*names, *(["score"] if len(names) > 1 else []), "KL", "advantage"]
@@ -108,7 +114,7 @@ def print_samples(
         figures += [row["score"]] if len(names) > 1 else []
         lines.append([shown(row["prompt"], tail=True), shown(row["response"]), *map(figure, figures)])
         lines[-1] += [figure(row["kl"]), figure(row["advantage"]) if row["counts"] else "masked"]
-    _print_table(["prompt", "response"], heads, lines, stream, width, title)
+    _print_table(["prompt", "response"], heads, lines, stream, width, title, console)
 
 
 def print_comparison(
@@ -153,6 +159,7 @@ def _print_table(
     stream: TextIO | None,
     width: int | None,
     title: str,
+    console: Any = None,
 ) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -165,7 +172,8 @@ def _print_table(
         table.add_column(Text(name), justify="right", no_wrap=True)
     for line in lines:
         table.add_row(*[Text(cell) for cell in line])  # Text: brackets in a response are not markup
-    Console(file=stream, width=width, markup=False, highlight=False).print(table)
+    console = console or Console(file=stream, width=width, markup=False, highlight=False)
+    console.print(table)
 
 
 def _finite(value: Any) -> float | None:

@@ -134,6 +134,7 @@ class Trainer:
                 self.report("update", {**event, **total})
                 if save_due(self.episodes / settings.total_episodes):
                     save_state(self, run)
+                    self.report("samples", {"step": self.episodes, "rows": rows})
             save_state(self, run)
             save_model(self.roles, run.path, settings)
             summary = self._summary(run, metrics)
