@@ -4,7 +4,7 @@
     python benchmarks/film_reviews.py --collect FOLDER   # the tables of runs that are there
 
 One SFT model and one reward model; PPO from them with each seed; once without a KL, once each with weights
-of the KL that stay as they are; and a third as long with each kind of critic. The gold judge has read other
+of the KL that stay as they are; and shorter with each kind of critic. The gold judge has read other
 reviews than the reward model and is asked on the beginnings of reviews that PPO never saw: P(positive) of 512
 responses before and after. Settings were tuned on seeds 1 to 3, which are not among the seeds.
 """
@@ -28,12 +28,12 @@ from speed_runs import HERE, our_environment
 RESULTS = HERE / "results" / "language" / "film_reviews.json"
 PAGE, README = HERE.parent / "docs" / "benchmarks.md", HERE.parent / "README.md"
 DEMO = HERE.parent / "demos" / "sentiment.py"
-SEEDS = (31, 32, 33, 34, 35)
+SEEDS = (41, 42, 43, 44, 45)
 CRITICS = ("head", "adapter", "separate")
-SHORT = 4096  # responses of a run that compares critics
+SHORT = 3072  # responses of a run that compares critics
 JOBS: dict[str, tuple[str, ...]] = {
     **{f"seed-{seed}": ("--seed", str(seed)) for seed in SEEDS},
-    **{f"beta-{beta:g}": ("--seed", "36", "--kl-beta", str(beta)) for beta in (0.0, 0.02, 0.2)},
+    **{f"beta-{beta:g}": ("--seed", "46", "--kl-beta", str(beta)) for beta in (0.0, 0.02, 0.2)},
     "smollm2": ("--seed", "21", "--model", "smollm2"),
     **{
         f"critic-{critic}-{seed}": ("--seed", str(seed), "--critic", critic, "--episodes", str(SHORT))
@@ -83,7 +83,7 @@ def text(results: dict[str, Any]) -> str:
     for name, found in results["runs"].items():
         if name.startswith("critic"):
             continue
-        held = f"KL towards {found['kl_goal']:g}" if found["kl_goal"] else f"kl_beta {found['kl_beta']:g}"
+XX
         lines.append(
             f"| {found['model']}, seed {found['seed']}, {held} | {found['gold_before']:.2f} | "
             f"**{found['gold_after']:.2f}** | "
