@@ -83,9 +83,8 @@ def text(results: dict[str, Any]) -> str:
     for name, found in results["runs"].items():
         if name.startswith("critic"):
             continue
-XX
         lines.append(
-            f"| {found['model']}, seed {found['seed']}, {held} | {found['gold_before']:.2f} | "
+            f"| {found['model']}, seed {found['seed']}, kl_beta {found['kl_beta']:g} | {found['gold_before']:.2f} | "
             f"**{found['gold_after']:.2f}** | "
             f"{found['scores']:.2f} | {found['kl']:.1f} | {found['curve'][-1]['objective/distinct_2']:.2f} | "
             f"{found['ppo_seconds']:.0f} |"
