@@ -39,7 +39,7 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
         },
         "align": {
             "total_episodes": 11_264, "batch_size": 128, "minibatch_size": 32, "learning_rate": 1e-3,
-            "kl": "exact-split", "kl_beta": 0.06, "lora_rank": 32, "lora_layers": 2, "evaluate_every": 0.025,
+            "kl": "exact-split", "kl_beta": 0.075, "lora_rank": 32, "lora_layers": 2, "evaluate_every": 0.025,
             "held_out_prompts": 256,
         },
     },
