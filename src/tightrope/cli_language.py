@@ -87,9 +87,7 @@ def align(words: list[str]) -> int:
     from tightrope.language.align import align as run_align
 
     def run(report: Any) -> dict[str, Any]:
-        return run_align(
-            settings, gold=given.get("gold"), run_dir=given.get("run_dir"), report=report
-        ).summary
+        return run_align(settings, run_dir=given.get("run_dir"), report=report).summary
 
     return _watched(run, display.ALIGN, "responses", given)
 
@@ -107,7 +105,7 @@ def resume(given: dict[str, Any]) -> int:
     from tightrope.language.align import resume_align
 
     def run(report: Any) -> dict[str, Any]:
-        more = {"prompts": given.get("data"), "reward": given.get("reward")}
+        more = {"prompts": given.get("data"), "reward": given.get("reward"), "gold": given.get("gold")}
         return resume_align(
             given["run"], total_episodes=given.get("total_steps"), report=report, **more
         ).summary
@@ -244,11 +242,6 @@ def _align_parser() -> Parser:
     group.add_argument(
         "--recipe", choices=tuple(RECIPES), metavar="NAME", help=f"One of: {', '.join(RECIPES)}."
     )
-    group.add_argument(
-        "--gold",
-        metavar="REWARD",
-        help="A second judge, for held-out prompts; never trained on (default: none).",
-    )
     return parser
 
 
@@ -261,7 +254,7 @@ def _run_options(parser: Parser) -> None:
     output(parser)
 
 
-NOT_SETTINGS = ("run_dir", "dry_run", "json", "quiet", "recipe", "gold")
+NOT_SETTINGS = ("run_dir", "dry_run", "json", "quiet", "recipe")
 
 
 def _values(given: dict[str, Any]) -> dict[str, Any]:

@@ -166,6 +166,11 @@ def resume_parser() -> Parser:
         help="align: the reward again, where it was your own code (default: the run's).",
     )
     group.add_argument(
+        "--gold",
+        metavar="R",
+        help="align: the gold judge again, where it was your own code (default: the run's).",
+    )
+    group.add_argument(
         "--data",
         metavar="FILE",
         help="Language: the data again, where they were no file, or lie elsewhere (default: the run's).",

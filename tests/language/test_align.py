@@ -119,10 +119,15 @@ def test_gpt2_without_pad_token(tmp_path):
     assert run.summary["episodes"] == 64
 
 
+def vowels(completions, **_):
+    return [sum(c in "aeiou" for c in text) / 6 for text in completions]
+
+
 def test_a_run_that_goes_on_ends_where_one_without_a_break_does(folder, tmp_path):
-    """To the last bit: weights, optimiser, random numbers, prompt order, kl_beta."""
-    values = {**FAST, "checkpoint_every": 0.5, "kl_goal": 1.0, "kl_horizon": 100.0}
-    whole = align(model=folder, prompts=PROMPTS, reward=letters, run_dir=tmp_path / "a", **values)
+    """To the last bit: weights, optimiser, random numbers, prompt order, kl_beta, what the gold judge saw."""
+    values = {**FAST, "checkpoint_every": 0.5, "kl_goal": 1.0, "kl_horizon": 100.0, "evaluate_every": 0.3}
+    given = {"prompts": PROMPTS, "reward": letters, "gold": vowels}
+    whole = align(model=folder, run_dir=tmp_path / "a", **given, **values)
     half = tmp_path / "b"
 
     class Cut(Exception):
@@ -133,10 +138,14 @@ def test_a_run_that_goes_on_ends_where_one_without_a_break_does(folder, tmp_path
             raise Cut
 
     with pytest.raises(Cut):
-        align(model=folder, prompts=PROMPTS, reward=letters, run_dir=half, report=stop, **values)
-    with pytest.raises(ValueError, match="no file may import"):
-        resume_align(half, prompts=PROMPTS)
-    again = resume_align(half, prompts=PROMPTS, reward=letters)
+        align(model=folder, run_dir=half, report=stop, **given, **values)
+    for missing in ("reward", "gold"):
+        with pytest.raises(ValueError, match=f"The {missing} of .* no file may import"):
+            resume_align(half, **{**given, missing: None})
+    again = resume_align(half, **given)
+    assert sum(row.get("eval/gold") is not None for row in whole.metrics) >= 2
+    seconds = [row["seconds"] for row in again.metrics]
+    assert seconds == sorted(seconds)
     drop = lambda row: {k: v for k, v in row.items() if not k.startswith("time/") and k != "seconds"}  # noqa: E731
     assert [drop(row) for row in again.metrics] == [drop(row) for row in whole.metrics]
     from safetensors.torch import load_file
@@ -195,7 +204,13 @@ def test_trl_reward_functions_run_unchanged(folder, tmp_path):
         ({"reward": "nowhere.py:f"}, "nowhere"),
         ({"reward": 3}, "reward is 3"),
         ({"reward": lambda prompts, completions, **_: [1.0]}, "1"),
-        ({"critic": "none"}, "samples_per_prompt"),
+        ({"critic": None}, "samples_per_prompt"),
+        ({"critic": None, "samples_per_prompt": 4, "critic_warmup": 1}, "critic_warmup needs a critic"),
+        ({"critic": None, "samples_per_prompt": 4, "truncation": "bootstrap"}, "truncation needs a critic"),
+        ({"total_episodes": 3, "samples_per_prompt": 4}, "not one prompt"),
+        ({"tune": "full", "dtype": "bfloat16"}, "steps of 1e-5 are lost"),
+        ({"prompts": ["a", "b", "c", "a"], "gold": letters}, "at least 4"),
+        ({"reward": (letters, float("nan"))}, "finite"),
         ({"kl": "k3-reward"}, "allow-biased-kl"),
         ({"learning_rte": 1.0}, "learning_rate"),
         ({"model": "no such model"}, "no such model"),

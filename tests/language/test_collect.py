@@ -12,7 +12,7 @@ import torch
 from language.test_roles import PROMPTS, fresh, settings, shake
 from language.tiny import saved, tiny_llama
 
-from tightrope.language.collect import describe, gather, rewards_of, to_batch
+from tightrope.language.collect import describe, gather, kl_share, rewards_of, to_batch
 from tightrope.language.rewards import Scores
 from tightrope.language.trainer import PolicyModel
 
@@ -117,7 +117,8 @@ def test_nan_behind_a_response_reaches_no_reward_advantage_or_metric(folder, val
         batch = to_batch(experience, rewards, EVERY, roles.settings)
         numbers = (rewards, batch.advantages, batch.returns)
         found.append([scale, *(x[batch.mask] for x in numbers)])
-        found[-1] += describe(experience, SCORES, rewards, EVERY).values()
+        share = kl_share(experience, roles.settings, 0.05)
+        found[-1] += describe(experience, SCORES, rewards, share, EVERY).values()
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
 
@@ -191,7 +192,8 @@ def test_every_metric_of_a_rollout_by_hand():
         ids=lambda: [[5, 6], [5, 6, 5], [7]],
     )  # fmt: skip
     rewards = torch.tensor([[-0.1, 1.0, 0.0], [5.0, 5.0, 5.0], [0.5, 0.0, 0.0]])
-    found = describe(experience, scores_of(1.0, nan, 0.5), rewards, torch.tensor([True, False, True]))
+    share = torch.tensor([[-0.1, -0.2, nan], [5.0, 5.0, 5.0], [0.1, nan, nan]])
+    found = describe(experience, scores_of(1.0, nan, 0.5), rewards, share, torch.tensor([True, False, True]))
     k1 = [0.5, -1.0, -8.0, -8.0, -8.0, -0.25]  # log p - log p_ref, negative ones too
     wanted = {
         "objective/kl": sum(k1) / 3,
@@ -202,7 +204,7 @@ def test_every_metric_of_a_rollout_by_hand():
         "objective/scores": 0.75,
         "objective/scores_std": 0.25,
         "objective/rlhf_reward": 1.4 / 2,
-        "objective/non_score_reward": 0.7 - 0.75,
+        "objective/non_score_reward": -0.2 / 2,
         "objective/entropy": 30.5 / 3,
         "objective/entropy_token_mean": 22.5 / 6,
         "objective/response_length": 2.0,
@@ -217,12 +219,33 @@ def test_every_metric_of_a_rollout_by_hand():
     assert found == {name: pytest.approx(value, rel=1e-6, abs=1e-6) for name, value in wanted.items()}
 
 
+def test_without_a_signal_nothing_is_learnt_from_rounding(folder):
+    """Sampling and training differ by 1e-7; normalised advantages would make full steps of that."""
+    roles = fresh(settings(folder))
+    experience = gather(roles, PROMPTS, 1, 0, 2)
+    assert not torch.equal(experience.responses.logp, experience.logp)
+    rewards, _ = rewards_of(experience, scores_of(*[0.0] * 6), roles.settings, 0.05)
+    assert not rewards.any()
+    assert not to_batch(experience, rewards, EVERY, roles.settings).advantages.any()
+
+
+def test_the_share_of_the_kl_has_nothing_of_the_score(folder):
+    _, experience = experienced(settings(folder))
+    experience.ref_logp -= 0.5
+    for values in ({"reward_scale": 2.0}, {"reward_clip": 1.0}, {"missing_eos_penalty": 3.0}, {}):
+        present = settings(folder, **values)
+        rewards, _ = rewards_of(experience, SCORES, present, 0.1)
+        found = describe(experience, SCORES, rewards, kl_share(experience, present, 0.1), EVERY)
+        assert found["objective/non_score_reward"] == pytest.approx(-0.1 * found["objective/kl"], rel=1e-5)
+
+
 def test_where_no_response_counts_the_kl_is_known_and_the_score_is_not(folder):
     """A KL of 0 there would lift every budget, and be a false point of the over-optimisation curve."""
     _, experience = experienced(settings(folder))
     experience.ref_logp -= 1.0
-    some = describe(experience, scores_of(*range(6)), torch.zeros(6, 10), EVERY)
-    none = describe(experience, scores_of(*[math.nan] * 6), torch.zeros(6, 10), ~EVERY)
+    nothing = torch.zeros(6, 10)
+    some = describe(experience, scores_of(*range(6)), nothing, nothing, EVERY)
+    none = describe(experience, scores_of(*[math.nan] * 6), nothing, nothing, ~EVERY)
     assert none["objective/kl"] == some["objective/kl"] > 1
     assert math.isnan(none["objective/scores"]) and math.isnan(none["objective/rlhf_reward"])
 

@@ -44,6 +44,18 @@ def test_a_function_called_like_the_reward_model_keeps_its_column(sampled):
     assert scores.metrics == {"scores/reward_model": 1.0, "scores/reward_model_2": 2.5}
 
 
+def test_every_kind_of_reward_takes_a_weight(sampled):
+    roles, experience = sampled
+    one, other = make_judge(["length", reward_model], roles, on_trunk=None, timeout=None), make_judge(
+        [("length", 0.5), (reward_model, -2)], roles, on_trunk=None, timeout=None
+    )  # fmt: skip
+    lengths = one(ASKED, experience).total - 1.0
+    assert other(ASKED, experience).total == pytest.approx(0.5 * lengths - 2.0)
+    scores = Judge(roles, Rewards([reward_model]), model_of(*range(6)), None, 0.5)(ASKED, experience)
+    assert scores.total.tolist() == [1, 1.5, 2, 2.5, 3, 3.5]
+    assert scores.parts["reward_model_2"].tolist() == [0, 1, 2, 3, 4, 5]  # a column is before its weight
+
+
 def test_a_score_of_the_model_that_is_not_finite_masks_its_response_and_says_so(sampled):
     roles, experience = sampled
     for functions, constant in ((None, 0.0), (Rewards([reward_model]), 1.0)):
@@ -114,7 +126,7 @@ def test_what_cannot_judge_is_named(sampled, tmp_path):
         (other, "reads .* tokens, the policy writes .* others"),
         (str(tmp_path), "is no reward model"),
         (3, "reward is 3; expected a function"),
-        ((good, 0.5), "expected a callable"),
+        ((good, "x"), "expected a finite number"),
     ]:
         with pytest.raises(ValueError, match=message):
             make_judge(reward, roles, on_trunk=None, timeout=None)

@@ -8,11 +8,12 @@ from language.tiny import saved, tiny_llama
 from tightrope.algorithms import ppo
 from tightrope.language import lora
 from tightrope.language.collect import gather
+from tightrope.language.data import Prompt
 from tightrope.language.fitting import silent
 from tightrope.language.kl import KL_FORMS, AdaptiveKL
 from tightrope.language.reward_model import train_reward
 from tightrope.language.settings import AlignSettings, RewardSettings
-from tightrope.language.trainer import Trainer
+from tightrope.language.trainer import Grid, Trainer, hold_out
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
 
@@ -92,6 +93,41 @@ def test_micro_batches_change_no_metric(folder, form):
         found.append({name: x for name, x in metrics.items() if name[:5] != "time/"})
     assert found[0] == pytest.approx(found[1], rel=1e-2, abs=1e-4)
     assert found[0]["train/kl_loss"] > 0.05
+
+
+@pytest.mark.parametrize("micro", [1, 3, 5])
+def test_the_pretraining_loss_adds_up_over_micro_batches(folder, tmp_path, micro):
+    """Texts of very different lengths: a part's mean weighs otherwise than the minibatch's."""
+    texts = tmp_path / "texts.txt"
+    texts.write_text("ab\nbcdefghijklmnopqrst\ncd\nxyzxyzxyz\n")
+    found = []
+    for size in (None, micro):
+        made = trainer(folder, micro_batch_size=size, minibatch_size=16, ptx_weight=27.8, ptx_data=str(texts),
+                       ptx_per_response=2, max_grad_norm=None, num_epochs=1)  # fmt: skip
+        gradients = []
+        made.optimiser.register_step_pre_hook(
+            lambda *_, made=made, gradients=gradients: gradients.append(
+                torch.cat([p.grad.flatten() for p in made.roles.parameters() if p.grad is not None])
+            )
+        )
+        next(made.iterate())
+        found.append(gradients[0])
+    assert float((found[0] - found[1]).norm()) <= 1e-4 * float(found[0].norm())
+
+
+def test_held_out_prompts_are_never_trained_on_not_even_twins():
+    prompts = [Prompt((k % 9,), str(k), {}) for k in range(30)]
+    kept, held = hold_out(prompts, 2)
+    assert len(held) == 2 and not {p.tokens for p in held} & {p.tokens for p in kept}
+    assert len(hold_out(prompts, 100)[1]) == 2  # a quarter of nine different ones
+    with pytest.raises(ValueError, match="3 different prompts"):
+        hold_out(prompts[:3] * 4, 1)
+
+
+def test_a_grid_is_met_once_a_point():
+    grid = Grid(0.25, from_start=False)
+    assert [grid.due(k / 10) for k in range(11)] == [k in (3, 5, 8, 10) for k in range(11)]
+    assert Grid(0.5, from_start=True).due(0.0) and not Grid(None, from_start=True).due(1.0)
 
 
 def test_the_settings_of_the_update_reach_the_update(folder, monkeypatch):

@@ -40,7 +40,7 @@ def align(
     Everything else is a field of AlignSettings or RLHFSettings. Raises ValueError for what cannot work,
     before anything is trained.
     """
-    settings = (settings or AlignSettings()).with_values(**_named(prompts, reward), **values)
+    settings = (settings or AlignSettings()).with_values(**_named(prompts, reward, gold), **values)
     for risk in settings.risks():
         report("line", {"text": f"warning: {risk}", "warning": True})
     if (bias := bias_of(settings.kl)) is not None:
@@ -51,7 +51,7 @@ def align(
         settings,
         settings.data if prompts is None else prompts,
         settings.reward if reward is None else reward,
-        gold,
+        settings.gold if gold is None else gold,
         report,
     )
     run = Run.create(
@@ -60,10 +60,10 @@ def align(
     return trainer.run(run)
 
 
-def _named(prompts: Any, reward: Any) -> dict[str, str]:
+def _named(prompts: Any, reward: Any, gold: Any) -> dict[str, str]:
     """What settings.json says of objects that were given in Python: their names, for display."""
     found = {}
-    for name, value in (("data", prompts), ("reward", reward)):
+    for name, value in (("data", prompts), ("reward", reward), ("gold", gold)):
         if value is not None:
             found[name] = (
                 str(value)
@@ -92,11 +92,13 @@ def resume_align(
     settings = settings_from_json(run.settings)
     if total_episodes is not None:
         settings = settings.with_values(total_episodes=total_episodes)
-    if reward is None and settings.reward != "length" and not Path(settings.reward).is_dir():
-        raise ValueError(
-            f"{run_dir} was trained against {settings.reward!r}, which no file may import. Name it again: "
-            f"tightrope resume {run_dir} --reward FILE.py:function"
-        )
+    for name, value in (("reward", reward), ("gold", gold)):
+        known = getattr(settings, name)
+        if value is None and known not in (None, "length") and not Path(known).is_dir():
+            raise ValueError(
+                f"The {name} of {run_dir} was {known!r}: code, which no file may import, or a folder that is "
+                f"not there any more. Name it again: tightrope resume {run_dir} --{name} FILE.py:function"
+            )
     if prompts is None and not Path(settings.data).is_file():
         raise ValueError(
             f"The prompts of {run_dir} were {settings.data!r}, which is no file. Give them again: "
@@ -107,7 +109,7 @@ def resume_align(
     sources = (
         settings.data if prompts is None else prompts,
         settings.reward if reward is None else reward,
-        gold,
+        settings.gold if gold is None else gold,
     )
     trainer = Trainer(settings, *sources, report)
     restore_state(trainer, run.newest_checkpoint())

@@ -138,6 +138,17 @@ def _look(roles: Roles, tokens: Tensor, real: Tensor, responses: Responses, rows
     return {**found, "values": values, "final_values": final, "lower": lower, "ref_hidden": kept}
 
 
+def kl_share(experience: Experience, settings: AlignSettings, kl_beta: float) -> Tensor:
+    """What the KL to the reference adds to the reward of each token, [B, R]; 0 where it is all in the loss.
+
+    Its log-probabilities are those of the pass that trains, for policy and reference alike: before the first
+    step they are equal to the bit, where those of sampling differ by rounding, which normalised advantages
+    would blow up to full strength.
+    """
+    steps = (experience.ref_logp, experience.exact, experience.responses.mask, settings.update.gamma)
+    return kl_rewards(settings.kl, kl_beta, experience.logp, *steps)
+
+
 def rewards_of(
     experience: Experience, scores: Scores, settings: AlignSettings, kl_beta: float
 ) -> tuple[Tensor, float]:
@@ -151,10 +162,7 @@ def rewards_of(
         total = total.clamp(-settings.reward_clip, settings.reward_clip)
     if settings.missing_eos_penalty is not None:
         total = torch.where(experience.responses.ended, total, total - settings.missing_eos_penalty)
-    # the two log-probabilities of the KL come from one kind of pass: in bfloat16 sampling rounds otherwise
-    logp = experience.responses.logp if settings.dtype == "float32" else experience.logp
-    steps = (experience.ref_logp, experience.exact, mask, settings.update.gamma)
-    found = kl_rewards(settings.kl, kl_beta, logp, *steps)
+    found = kl_share(experience, settings, kl_beta)
     found[rows, experience.last] += total
     if not settings.whiten_rewards:
         return found, 1.0
@@ -175,7 +183,7 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
         terminated[rows, experience.last] = experience.responses.ended
     update, values = settings.update, experience.values
     if settings.critic == "none":
-        advantages = leave_one_out(rewards, mask, valid, settings.samples_per_prompt)
+        advantages = leave_one_out(rewards, mask, valid, settings.samples_per_prompt, settings.update.gamma)
         targets = torch.zeros_like(rewards)
     else:
         following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], 1)
@@ -203,22 +211,25 @@ def length_lambda(lengths: Tensor, alpha: float) -> Tensor:
     return (1.0 - 1.0 / (alpha * lengths.float())).clamp(min=0.0)
 
 
-def leave_one_out(rewards: Tensor, mask: Tensor, valid: Tensor, samples: int) -> Tensor:
+def leave_one_out(rewards: Tensor, mask: Tensor, valid: Tensor, samples: int, gamma: float = 1.0) -> Tensor:
     """Advantages without a critic: reward to go minus the mean return of the prompt's *other* responses.
 
     The baseline does not depend on the response it is subtracted from, so it adds no bias (Kool et al. 2019).
     Rows of one prompt are neighbours; a response whose score does not count is nobody's baseline.
     """
     ended = torch.zeros_like(mask)
-    to_go = returns.discounted_returns(rewards, ended, 1.0, mask=mask)
-    total = torch.where(valid, torch.where(mask, rewards, 0.0).sum(1), 0.0).view(-1, samples)
+    to_go = returns.discounted_returns(rewards, ended, gamma, mask=mask)
+    total = torch.where(valid & mask[:, 0], to_go[:, 0], 0.0).view(-1, samples)
     count = valid.view(-1, samples).to(total)
     others = (total.sum(1, keepdim=True) - total) / (count.sum(1, keepdim=True) - count).clamp(min=1)
     return torch.where(mask, to_go - others.view(-1, 1), 0.0)
 
 
-def describe(experience: Experience, scores: Scores, rewards: Tensor, valid: Tensor) -> dict[str, float]:
-    """The metrics of a rollout: sums over a response, and token means under names that say so.
+def describe(
+    experience: Experience, scores: Scores, rewards: Tensor, kl_share: Tensor, valid: Tensor
+) -> dict[str, float]:
+    """The metrics of a rollout: sums over a response, and token means under names that say so. ``rewards``
+    and the share of the KL in them, before any scaling, are [B, R].
 
     Scores and rewards are those of the responses that count, everything else is of all of them; NaN for a
     score where none counts.
@@ -231,8 +242,11 @@ def describe(experience: Experience, scores: Scores, rewards: Tensor, valid: Ten
         return float(masked_sum(x, mask)) / count
 
     total, ended = scores.total[scores.valid], experience.responses.ended
-    counting = float(masked_sum(rewards, mask & valid[:, None])) / len(total) if len(total) else float("nan")
     score = float(np.mean(total)) if len(total) else float("nan")
+
+    def of_valid(x: Tensor) -> float:
+        return float(masked_sum(x, mask & valid[:, None])) / len(total) if len(total) else float("nan")
+
     gap = (experience.responses.logp - experience.logp)[mask].abs()
     return {
         "objective/kl": per_response(divergence.k1(log_ratio)),
@@ -242,8 +256,8 @@ def describe(experience: Experience, scores: Scores, rewards: Tensor, valid: Ten
         "objective/kl_token_mean": float(masked_mean(divergence.k1(log_ratio), mask)),
         "objective/scores": score,
         "objective/scores_std": float(np.std(total)) if len(total) else float("nan"),
-        "objective/rlhf_reward": counting,
-        "objective/non_score_reward": counting - score,
+        "objective/rlhf_reward": of_valid(rewards),
+        "objective/non_score_reward": of_valid(kl_share),
         "objective/entropy": per_response(-experience.logp),
         "objective/entropy_token_mean": float(masked_mean(experience.entropy, mask)),
         "objective/response_length": float(mask.sum()) / count,

@@ -15,7 +15,7 @@ from tightrope.language.token_stats import Sampling, token_statistics
 
 
 class Pretraining:
-    """Texts whose mean negative log-likelihood per token, at temperature 1, is added to PPO's loss."""
+    """Texts whose negative log-likelihood, at temperature 1, is added to PPO's loss."""
 
     def __init__(self, roles: Roles, examples: list[Example], per_response: int, seed: int) -> None:
         self.roles, self.examples, self.per_response = roles, examples, per_response
@@ -31,8 +31,11 @@ class Pretraining:
         )
         return cls(roles, examples, settings.ptx_per_response, settings.seed)
 
-    def loss(self, responses: int) -> Tensor:
-        """The loss on fresh texts, ``per_response`` for each of ``responses``."""
+    def loss(self, responses: int) -> tuple[Tensor, int]:
+        """-log p summed over fresh texts, ``per_response`` for each of ``responses``, and their tokens.
+
+        The texts do not depend on how responses are split into calls.
+        """
         device = next(self.roles.model.parameters()).device
         chosen = self.rng.integers(len(self.examples), size=responses * self.per_response)
         picked = [self.examples[int(i)] for i in chosen]
@@ -47,4 +50,4 @@ class Pretraining:
         found = token_statistics(
             hidden[:, :-1][targets], self.roles.trunk.parts.head, tokens[:, 1:][targets], Sampling()
         )
-        return -found.logp.mean()
+        return -found.logp.sum(), len(found.logp)

@@ -71,6 +71,8 @@ def save_state(trainer: Trainer, run: Run) -> Path:
         "prompt_position": trainer.order.position,
         "rng": {"update": trainer.update_rng.bit_generator.state},
         "monitor": trainer.monitor.state(),
+        "gold_point": trainer.gold_grid.point,
+        "seconds": trainer.seconds,
     }
     if trainer.pretraining is not None:
         state["rng"]["ptx"] = trainer.pretraining.rng.bit_generator.state
@@ -88,6 +90,7 @@ def restore_state(trainer: Trainer, folder: Path) -> None:
     trainer.order.position = int(state["prompt_position"])
     trainer.update_rng.bit_generator.state = state["rng"]["update"]
     trainer.monitor.restore(state["monitor"])
+    trainer.gold_grid.point, trainer.seconds = state["gold_point"], float(state["seconds"])
     if trainer.pretraining is not None:
         trainer.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 

@@ -4,6 +4,7 @@ functions.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ class Judge:
     """Scores of whole responses, from functions of the text and from a reward model, weighted and added up.
 
     ``adapter``: a reward adapter on the policy's trunk with its head [1, d] and shift; ``model``: one with a
-    trunk of its own, which must know the policy's tokens.
+    trunk of its own, which must know the policy's tokens; ``weight``: of either.
     """
 
     def __init__(
@@ -34,8 +35,10 @@ class Judge:
         functions: Rewards | None = None,
         model: RewardModel | None = None,
         adapter: tuple[Tensor, float] | None = None,
+        weight: float = 1.0,
     ) -> None:
         self.roles, self.functions, self.model, self.adapter = roles, functions, model, adapter
+        self.weight = weight
 
     def __call__(
         self, prompts: Sequence[Prompt], experience: Experience, trainer_state: Any = None
@@ -44,7 +47,7 @@ class Judge:
         found = self._of_functions(prompts, experience, trainer_state)
         learnt = self._of_model(experience)
         if learnt is not None:
-            return with_model(found, learnt)
+            return with_model(found, learnt, self.weight)
         assert found is not None
         return found
 
@@ -81,7 +84,7 @@ class Judge:
         return torch.cat(scores).double().cpu().numpy()
 
 
-def with_model(found: Scores | None, learnt: np.ndarray) -> Scores:
+def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) -> Scores:
     """The functions' scores and a reward model's, [B], added up.
 
     Where no function applies the model's stands alone. A score of the model that is not finite masks its
@@ -106,7 +109,7 @@ def with_model(found: Scores | None, learnt: np.ndarray) -> Scores:
         text = f"The reward model gave {learnt[bad[0]]} for {where}, expected a finite number."
         faults.append(Fault(name, "not finite", bad, text))
     return Scores(
-        total=np.where(valid, np.where(alone, 0.0, found.total) + part, np.nan),
+        total=np.where(valid, np.where(alone, 0.0, found.total) + weight * part, np.nan),
         valid=valid,
         parts={**found.parts, name: part},
         metrics={**found.metrics, f"scores/{name}": float(part[good].mean())},
@@ -117,13 +120,14 @@ def with_model(found: Scores | None, learnt: np.ndarray) -> Scores:
 
 def is_folder(reward: Any) -> bool:
     """Whether a reward, or one of several, is the folder of a reward model."""
-    return any(isinstance(entry, str | Path) and Path(entry).is_dir() for entry in _entries(reward))
+    entries = (_bare(entry) for entry in _entries(reward))
+    return any(isinstance(entry, str | Path) and Path(entry).is_dir() for entry in entries)
 
 
 def reward_adapter(words: Any) -> Path | None:
     """The adapter folder of a reward model that was trained with LoRA, None for any other reward."""
-    for entry in _entries(words):
-        if isinstance(entry, str | Path) and (Path(entry) / "adapter" / "adapter_config.json").is_file():
+    for entry in map(_bare, _entries(words)):
+        if isinstance(entry, str | Path) and (Path(entry) / "adapter" / "head.safetensors").is_file():
             return Path(entry) / "adapter"
     return None
 
@@ -144,29 +148,39 @@ def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: flo
     ``on_trunk``: the folder of the adapter that `make_roles` has put on the trunk.
     """
     functions: list[Any] = []
-    model, adapter = None, None
-    for entry in _entries(reward):
-        if isinstance(entry, str | Path) and Path(entry).is_dir():
+    model, adapter, model_weight = None, None, 1.0
+    for entry, weight in map(_weighted, _entries(reward)):
+        if is_folder(entry):
             if model is not None or adapter is not None:
                 raise ValueError("Two reward models were given; expected one, and any number of functions.")
+            model_weight = weight
             if on_trunk is not None and reward_adapter(entry) == on_trunk:
                 adapter = read_head(on_trunk, roles)
             else:
                 model = load_reward(Path(entry)).to(roles.settings.device)
                 _same_tokens(model, roles, entry)
         elif isinstance(entry, str):
-            functions.append(load_reward_function(entry))
-        elif callable(entry) or (isinstance(entry, tuple) and len(entry) == 2):
-            functions.append(entry)
+            functions.append((load_reward_function(entry), weight))
+        elif callable(entry):
+            functions.append((entry, weight))
         else:
             raise ValueError(
-                f"reward is {entry!r}; expected a function, (function, weight), 'length', FILE.py:function, "
-                "or the folder of a reward model."
+                f"reward is {entry!r}; expected a function, 'length', FILE.py:function, the folder of a "
+                "reward model, one of these with its weight in a pair, or a list of them."
             )
     alone = model is None and adapter is None
-    return Judge(
-        roles, Rewards(functions, timeout=timeout, alone=alone) if functions else None, model, adapter
-    )
+    rewards = Rewards(functions, timeout=timeout, alone=alone) if functions else None
+    return Judge(roles, rewards, model, adapter, model_weight)
+
+
+def _weighted(entry: Any) -> tuple[Any, float]:
+    """A reward and its weight, 1 where none is given. ValueError for a weight that is no finite number."""
+    if not (isinstance(entry, tuple) and len(entry) == 2):
+        return entry, 1.0
+    reward, weight = entry
+    if isinstance(weight, bool) or not isinstance(weight, int | float) or not math.isfinite(weight):
+        raise ValueError(f"the weight of reward {reward!r} is {weight!r}; expected a finite number.")
+    return reward, float(weight)
 
 
 def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:
@@ -194,7 +208,7 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
     policy's hidden states cannot read what the reward model's hidden states say. ValueError for what does not
     fit.
     """
-    folder = next((entry for entry in _entries(reward) if is_folder(entry)), None)
+    folder = next((_bare(entry) for entry in _entries(reward) if is_folder(entry)), None)
     kind, head = roles.settings.critic, roles.critic_head
     if folder is None or head is None or kind == "head" or (kind == "adapter" and judge.adapter is None):
         raise ValueError(
@@ -220,6 +234,11 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
     with torch.no_grad():
         head.weight.copy_(weight)
         head.bias.fill_(-shift)
+
+
+def _bare(entry: Any) -> Any:
+    """A reward without its weight."""
+    return entry[0] if isinstance(entry, tuple) and len(entry) == 2 else entry
 
 
 def _entries(reward: Any) -> list[Any]:

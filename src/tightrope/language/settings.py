@@ -104,6 +104,9 @@ class AlignSettings(ModelSettings):
 
     data: str = setting("", "The prompts: a .jsonl, .json, .csv or .txt file, or a dataset's id.")
     reward: str = setting("", "length, FILE.py:function, or the folder of a reward model.")
+    gold: str | None = setting(
+        None, "A second judge of the same kinds, asked on held-out prompts; never trained on. none: no judge."
+    )
     update: RLHFSettings = dataclasses.field(
         default_factory=RLHFSettings, metadata={"doc": "The update rule's."}
     )
@@ -186,6 +189,20 @@ class AlignSettings(ModelSettings):
                 "responses; expected kl_beta above 0 and a horizon above a fifth of batch_size "
                 f"{self.batch_size}."
             )
+        if self.total_episodes < self.samples_per_prompt:
+            raise ValueError(
+                f"total_episodes {self.total_episodes} is less than samples_per_prompt "
+                f"{self.samples_per_prompt}: not one prompt could be answered. Give more."
+            )
+        if self.tune == "full" and self.dtype != "float32":
+            raise ValueError(
+                f"tune full with dtype {self.dtype}: steps of 1e-5 are lost on {self.dtype} weights. Use "
+                "dtype float32, or tune lora, whose adapters are float32 on any trunk."
+            )
+        idle = {"critic_warmup": 0, "critic_lambda": None, "lambda_alpha": None, "truncation": "terminal"}
+        acting = [name for name, usual in idle.items() if getattr(self, name) != usual]
+        if self.critic == "none" and acting:
+            raise ValueError(f"{', '.join(acting)} needs a critic, and critic is none. Leave it out.")
         if self.critic == "none" and self.samples_per_prompt < 2:
             raise ValueError(
                 "critic none compares the responses to one prompt; samples_per_prompt is 1. Give "
@@ -212,6 +229,8 @@ class AlignSettings(ModelSettings):
     def with_values(self, **values: Any) -> Self:
         """The same settings with these changed; names of the update rule's fields are found there."""
         outer = {field.name for field in dataclasses.fields(self)}
+        if "critic" in values and values["critic"] is None:
+            values["critic"] = "none"
         inner = {name: value for name, value in values.items() if name not in outer}
         own = {name: value for name, value in values.items() if name in outer}
         known = {field.name for field in dataclasses.fields(RLHFSettings)} - set(NOT_HERE)

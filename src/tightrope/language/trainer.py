@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ from torch import Tensor
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.algorithms.optimise import SamplingMismatch, make_optimiser, set_learning_rates
-from tightrope.language.collect import PromptOrder, describe, gather, rewards_of, to_batch
+from tightrope.language.collect import PromptOrder, describe, gather, kl_share, rewards_of, to_batch
 from tightrope.language.data import Prompt, read_prompts, read_rows
 from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
@@ -83,8 +83,7 @@ class Trainer:
         self.gold: Judge | None = None
         if gold is not None:
             self.gold = make_judge(gold, self.roles, on_trunk=None, timeout=settings.reward_timeout)
-            count = min(settings.held_out_prompts, len(self.prompts) // 4)
-            self.prompts, self.held_out = self.prompts[: len(self.prompts) - count], self.prompts[-count:]
+            self.prompts, self.held_out = hold_out(self.prompts, settings.held_out_prompts)
         if settings.critic_from_reward:
             critic_from_reward(self.judge, self.roles, reward)
         self.optimiser = make_optimiser(
@@ -96,7 +95,8 @@ class Trainer:
         self.pretraining = Pretraining.make(settings, self.roles) if settings.ptx_weight else None
         self.monitor = Monitor(kl_budget=settings.kl_budget)
         self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
-        self.gold_due, self._told = _grid(settings.evaluate_every, 0.0), set[tuple[str, str]]()
+        self.gold_grid, self._told = Grid(settings.evaluate_every, from_start=True), set[tuple[str, str]]()
+        self.seconds = 0.0
 
     def _read_prompts(self, source: Any) -> list[Prompt]:
         settings, limit = self.settings, context_length(self.roles.model)
@@ -118,21 +118,22 @@ class Trainer:
 
     def run(self, run: Run) -> Aligned:
         """Train until the budget is spent; the run folder then holds everything."""
-        settings, begin = self.settings, time.perf_counter()
+        settings, begin = self.settings, time.perf_counter() - self.seconds
         total = {"total_steps": settings.total_episodes}
         facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self._lines()}
         self.report("start", {"settings": dataclasses.asdict(settings), **facts, **total})
-        save_due = _grid(settings.checkpoint_every, settings.checkpoint_every)
+        saves = Grid(settings.checkpoint_every, from_start=False)
+        saves.due(self.episodes / settings.total_episodes)  # a run that goes on has been there
         metrics: dict[str, float] = {}
         with run:
             for metrics, rows in self.iterate():
-                metrics["time/seconds"] = time.perf_counter() - begin
+                metrics["time/seconds"] = self.seconds = time.perf_counter() - begin
                 self._watch(metrics)
                 run.record(self.episodes, metrics["time/seconds"], metrics)
                 run.record_samples(rows)
                 event = {"step": self.episodes, "metrics": metrics, "seconds": metrics["time/seconds"]}
                 self.report("update", {**event, **total})
-                if save_due(self.episodes / settings.total_episodes):
+                if saves.due(self.episodes / settings.total_episodes):
                     save_state(self, run)
                     self.report("samples", {"step": self.episodes, "rows": rows})
             save_state(self, run)
@@ -200,9 +201,10 @@ class Trainer:
         rewards, self.reward_scale = rewards_of(experience, scores, settings, self.kl_beta)
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
         batch = to_batch(experience, rewards, valid, settings)
-        metrics = describe(experience, scores, rewards, valid) | scores.metrics
+        share = kl_share(experience, settings, self.kl_beta)
+        metrics = describe(experience, scores, rewards, share, valid) | scores.metrics
         self._check_sampling(metrics["objective/sampling_gap"])
-        if self.gold is not None and self.gold_due(self.episodes / settings.total_episodes):
+        if self.gold is not None and self.gold_grid.due(self.episodes / settings.total_episodes):
             metrics["eval/gold"] = self.evaluate()  # of the policy whose KL this rollout tells
         if len(batch):
             metrics |= self._update(batch, present)
@@ -257,9 +259,10 @@ class Trainer:
                 total = total + kl_weight * kl
                 booked["kl_loss"] = kl.detach() * count / part.mask.sum().clamp(min=1) * part.mask
             if pretraining is not None:
-                loss = pretraining.loss(len(part))
-                total = total + self.settings.ptx_weight * loss * part.mask.sum() / count
-                booked["ptx_loss"] = loss.detach() * part.mask
+                # a sum over the texts of one response beside a sum over the response, as in InstructGPT
+                loss, tokens = pretraining.loss(len(part))
+                total = total + self.settings.ptx_weight * loss / (pretraining.per_response * count)
+                booked["ptx_loss"] = loss.detach() / tokens * part.mask
             return total, booked
 
         return extra if not form.endswith("reward") or pretraining is not None else None
@@ -296,17 +299,32 @@ class Trainer:
         return float(scores.total[scores.valid].mean()) if scores.valid.any() else float("nan")
 
 
-def _grid(fraction: float | None, first: float | None) -> Callable[[float], bool]:
-    """Whether a point of the grid ``first``, ``first + fraction`` ... of the run was reached since the last
-    call.
+def hold_out(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prompt]]:
+    """Prompts to train on and ``count`` (a quarter at most) that never are, not even as equals of themselves.
+
+    ValueError when there are too few different ones.
     """
-    ahead = {"point": first}
+    distinct = list({prompt.tokens: prompt for prompt in prompts}.values())
+    held = distinct[len(distinct) - min(count, len(distinct) // 4) :]
+    if not held:
+        raise ValueError(
+            f"There are {len(distinct)} different prompts; a gold score on held-out ones needs at least 4. "
+            "Give more, or no gold."
+        )
+    kept = {prompt.tokens for prompt in held}
+    return [prompt for prompt in prompts if prompt.tokens not in kept], held
 
-    def due(share: float) -> bool:
-        point = ahead["point"]
-        if fraction is None or point is None or share < point - 1e-9:
+
+class Grid:
+    """Points 0 or ``fraction``, then every ``fraction`` of a run; ``point`` is the next, None for none."""
+
+    def __init__(self, fraction: float | None, *, from_start: bool) -> None:
+        self.fraction = fraction
+        self.point = fraction if fraction is None or not from_start else 0.0
+
+    def due(self, share: float) -> bool:
+        """Whether the next point was reached; it then moves on."""
+        if self.fraction is None or self.point is None or share < self.point - 1e-9:
             return False
-        ahead["point"] = (int(share / fraction + 1e-9) + 1) * fraction
+        self.point = (int(share / self.fraction + 1e-9) + 1) * self.fraction
         return True
-
-    return due
