@@ -154,6 +154,90 @@ def test_dry_run_prints_the_settings_and_stops(capsys: pytest.CaptureFixture[str
     assert list(tmp_path.iterdir()) == []
 
 
+# ---------------------------------------------------------------------------- settings of the language story
+
+
+def shown(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    """The settings that a command resolves."""
+    code, out, err = run_main(capsys, *words, "--dry-run")
+    assert code == 0, err
+    return json.loads(out)
+
+
+@pytest.mark.parametrize("command", ["sft", "reward", "align"])
+def test_settings_of_a_language_run_run_again_and_flags_win(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str
+) -> None:
+    first = shown(capsys, command, "--data", "rows.jsonl", "--seed", "3", "--num-epochs", "2")
+    (tmp_path / "settings.json").write_text(json.dumps(first))
+    for path in (tmp_path, tmp_path / "settings.json"):
+        assert shown(capsys, command, "--settings", str(path)) == first
+    changed = shown(capsys, command, "--settings", str(tmp_path), "--seed", "4", "--learning-rate", "0.5")
+    assert changed["seed"] == 4 and changed.get("update", changed)["learning_rate"] == 0.5
+    assert changed["data"] == "rows.jsonl" and changed.get("update", changed)["num_epochs"] == 2
+
+
+def test_the_settings_of_another_command_are_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for command in ("sft", "reward", "align"):
+        (tmp_path / "settings.json").write_text(json.dumps(shown(capsys, command)))
+        for other in {"sft", "reward", "align"} - {command}:
+            code, _, err = run_main(capsys, other, "--settings", str(tmp_path), "--dry-run")
+            assert code == 2 and f"the settings of {command}, expected those of {other}" in err
+    (tmp_path / "settings.json").write_text(json.dumps(settings_to_json(TrainSettings())))
+    code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
+    assert code == 2 and "the settings of train" in err
+
+
+@pytest.mark.parametrize(
+    ("values", "flag", "again"),
+    [
+        ({"data": "<list>"}, "--data", "rows.jsonl"),
+        ({"reward": "score"}, "--reward", "length"),
+        ({"reward": "mine.py:score"}, "--reward", "mine.py:score"),
+        ({"gold": "mine.py:score"}, "--gold", "none"),
+    ],
+)
+def test_what_was_an_object_or_code_is_named_again(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, values: dict[str, str], flag: str, again: str
+) -> None:
+    settings = {**shown(capsys, "align", "--reward", "length"), **values}
+    (tmp_path / "settings.json").write_text(json.dumps(settings))
+    code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
+    assert code == 2 and f"Give it again: {flag}" in err and str(*values.values()) in err
+    found = shown(capsys, "align", "--settings", str(tmp_path), flag, again)
+    assert found[flag[2:]] == (None if again == "none" else again)
+
+
+def test_a_language_settings_file_is_checked(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for values, message in (
+        ({"batch_sise": 3}, "Did you mean 'batch_size'"),
+        ({"batch_size": "8"}, "batch_size is '8'; expected int"),
+        ({"update": 3}, "update is 3"),
+        ([], "holds list"),
+    ):
+        (tmp_path / "settings.json").write_text(json.dumps(values))
+        code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
+        assert code == 2 and message in err
+
+
+def test_a_flag_that_gathers_may_be_repeated() -> None:
+    parser = flags.Parser("x", "x", "x")
+    parser.add_argument("--prompt", action="append")
+    assert parser.read(["--prompt", "a", "--prompt", "b"]) == {"prompt": ["a", "b"]}
+
+
+def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
+    from tightrope.cli_language import _align_parser
+
+    text = " ".join(_align_parser().format_help().split())
+    assert "without its normalisation of rewards" in text
+    assert "without its language-modelling loss on correct responses" in text
+    ziegler = shown(capsys, "align", "--recipe", "ziegler2019")
+    assert ziegler["tune"] == "full" and ziegler["update"]["learning_rate"] == 1e-5
+
+
 # ---------------------------------------------------------------------------- settings as JSON
 
 
@@ -275,6 +359,12 @@ def test_every_peer_name_leads_to_a_real_flag() -> None:
         (["evaluate", "run", "--episodes", "0"], ["at least 1"]),
         (["resume", "run", "--total-timesteps", "3"], ["Did you mean --total-steps?"]),
         (["record", "run", "--seed", "-3"], ["at least 0"]),
+        (["sample", "run", "--count", "0"], ["--count", "at least 1"]),
+        (["sample", "run", "--recorded", "--count=-3"], ["--count", "at least 1"]),
+        (["align", "--reward", "length", "--reward", "gold.py:r"], ["--reward was given twice"]),
+        (["train", "X", "--num_envs=2", "--num-envs", "3"], ["--num-envs was given twice"]),
+        (["train", "X", "--shared", "--no-shared"], ["--shared and --no-shared was given twice"]),
+        (["sft", "--settings", "nowhere"], ["nowhere", "no such file"]),
     ],
 )
 def test_a_mistake_is_exit_code_2_and_a_message(

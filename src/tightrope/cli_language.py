@@ -21,7 +21,15 @@ from tightrope.language.settings import (
     RLHFSettings,
     SFTSettings,
 )
-from tightrope.options import PROGRAM, output, print_json
+from tightrope.options import (
+    OWN_FIELDS,
+    PROGRAM,
+    at_least_one,
+    file_values,
+    output,
+    print_json,
+    settings_option,
+)
 
 NEEDED = "The language story needs transformers. Install it with: pip install 'tightrope[language]'"
 
@@ -43,7 +51,7 @@ def reward(words: list[str]) -> int:
 
 
 def _supervised(name: str, kind: type, given: dict[str, Any]) -> int:
-    settings = _from_flags(kind, given)
+    settings = kind(**file_values(name, given.get("settings"), _values(given)), **_values(given))
     if _dry_run(settings, given):
         return 0
     if not settings.data:
@@ -73,9 +81,9 @@ def _stage(name: str) -> tuple[Callable[..., dict[str, Any]], Callable[..., dict
 def align(words: list[str]) -> int:
     """``tightrope align``: PPO against any reward."""
     given = _align_parser().read(words)
-    values = _values(given)
-    if (recipe := given.get("recipe")) is not None:
-        values = {**RECIPES[recipe].values, **values}
+    recipe = RECIPES[given["recipe"]].values if "recipe" in given else {}
+    flags = _values(given)
+    values = {**file_values("align", given.get("settings"), flags), **recipe, **flags}
     settings = AlignSettings().with_values(**values)
     if _dry_run(settings, given):
         return 0
@@ -97,8 +105,8 @@ def resume(given: dict[str, Any]) -> int:
     from tightrope.runs.run import Run
 
     settings = Run.open(given["run"]).settings
-    for name, own in (("sft", "on_completions"), ("reward", "demonstrations")):
-        if own in settings:
+    for name in ("sft", "reward"):
+        if OWN_FIELDS[name] in settings:
             return _resume_supervised(name, given)
     _require_transformers()
     from tightrope.language import display
@@ -142,7 +150,7 @@ def sample(words: list[str]) -> int:
         "--prompt", action="append", metavar="TEXT", help="A prompt of your own; may be repeated."
     )
     group.add_argument(
-        "--count", type=int, metavar="N", help="How many prompts of the run's data (default 8)."
+        "--count", type=at_least_one, metavar="N", help="How many prompts of the run's data (default 8)."
     )
     group.add_argument("--seed", type=int, metavar="N", help="Seed of sampling (default: the run's + 1).")
     group.add_argument(
@@ -250,19 +258,16 @@ def _run_options(parser: Parser) -> None:
     group.add_argument(
         "--run-dir", metavar="FOLDER", help="Where the run lies (default runs/COMMAND-MODEL-TIME)."
     )
+    settings_option(group)
     group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
     output(parser)
 
 
-NOT_SETTINGS = ("run_dir", "dry_run", "json", "quiet", "recipe")
+NOT_SETTINGS = ("run_dir", "settings", "dry_run", "json", "quiet", "recipe")
 
 
 def _values(given: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in given.items() if name not in NOT_SETTINGS}
-
-
-def _from_flags(kind: type, given: dict[str, Any]) -> Any:
-    return kind(**_values(given))
 
 
 def _dry_run(settings: Any, given: dict[str, Any]) -> bool:

@@ -54,7 +54,21 @@ class Parser(argparse.ArgumentParser):
             name = word[2:].partition("=")[0]
             if word.startswith("--") and name not in known:
                 raise UsageError((unknown or unknown_flag)(name, known))
+        self._refuse_repeated(words)
         return vars(self.parse_args(words))
+
+    def _refuse_repeated(self, words: list[str]) -> None:
+        """UsageError for a flag that stands twice, on or off, unless it gathers what it is given."""
+        names = {s: action for action in self._actions for s in action.option_strings}
+        seen: dict[str, str] = {}
+        for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
+            action = names[flag]
+            if action.dest in seen and not isinstance(action, argparse._AppendAction):
+                both = flag if seen[action.dest] == flag else f"{seen[action.dest]} and {flag}"
+                raise UsageError(
+                    f"{both} was given twice, expected once: only the last would count. Leave one out."
+                )
+            seen[action.dest] = flag
 
 
 def _formatter(prog: str) -> argparse.HelpFormatter:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings, values_from_json
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings, typed_values, values_from_json
 from tightrope.flags import (
     Parser,
     UsageError,
@@ -31,6 +31,8 @@ GROUPS = {
 }
 
 Options = dict[str, Any]
+# a setting that tells a command's settings.json from the others'
+OWN_FIELDS = {"sft": "on_completions", "reward": "demonstrations", "align": "max_new_tokens", "train": "env"}
 
 
 def print_json(value: dict[str, Any]) -> None:
@@ -47,6 +49,13 @@ def output(parser: Parser) -> None:
         "--json", action="store_true", help="Last line of stdout: one JSON object; the rest on stderr."
     )
     group.add_argument("--quiet", action="store_true", help="Print the end only.")
+
+
+def settings_option(group: Any) -> None:
+    """The option that begins with the settings of another run."""
+    group.add_argument(
+        "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
+    )
 
 
 def _common(parser: Parser, *, run: bool) -> None:
@@ -93,9 +102,7 @@ def train_parser(algorithm: str = "ppo") -> Parser:
     group.add_argument(
         "--run-dir", metavar="FOLDER", help="Where the run lies (default runs/ENV-ALGORITHM-SEED-TIME)."
     )
-    group.add_argument(
-        "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
-    )
+    settings_option(group)
     group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
     _common(parser, run=False)
     return parser
@@ -110,7 +117,7 @@ def evaluate_parser() -> Parser:
     )
     parser.add_argument("run", metavar="RUN", help="Run folder, or a folder that agent.save wrote.")
     group = parser.add_argument_group("evaluation")
-    group.add_argument("--episodes", type=_at_least_one, metavar="N", help="How many (default 100).")
+    group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 100).")
     group.add_argument(
         "--stochastic", action="store_true", help="Sample actions; default: the most likely one."
     )
@@ -133,7 +140,7 @@ def record_parser() -> Parser:
     parser.add_argument("run", metavar="RUN", help="Run folder, or a folder that agent.save wrote.")
     group = parser.add_argument_group("recording")
     group.add_argument("--out", metavar="FILE.mp4", help="Where to (default RUN/videos/).")
-    group.add_argument("--episodes", type=_at_least_one, metavar="N", help="How many (default 1).")
+    group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 1).")
     group.add_argument("--best", action="store_true", help="The policy that evaluated best, not the newest.")
     group.add_argument(
         "--seed",
@@ -156,7 +163,7 @@ def resume_parser() -> Parser:
     group = parser.add_argument_group("going on")
     group.add_argument(
         "--total-steps",
-        type=_at_least_one,
+        type=at_least_one,
         metavar="N",
         help="A new end (align: responses); also continues a finished run (default: the run's own).",
     )
@@ -179,7 +186,8 @@ def resume_parser() -> Parser:
     return parser
 
 
-def _at_least_one(word: str) -> int:
+def at_least_one(word: str) -> int:
+    """A whole number above 0, as argparse reads it."""
     return _bounded(word, 1)
 
 
@@ -201,7 +209,7 @@ def train_options(words: list[str]) -> tuple[Options, Options]:
     """What the flags say and what the settings file says; the update rule decides which flags there are."""
     words = [with_dashes(word) for word in words]
     path = _value_of("--settings", words)
-    file_values = _settings_file(path) if path else {}
+    file_values = values_from_json(read_settings(path)) if path else {}
     algorithm = _value_of("--algorithm", words) or file_values.get("algorithm", "ppo")
     if algorithm not in ALGORITHM_SETTINGS:
         algorithm = "ppo"  # the parser words the error
@@ -237,14 +245,15 @@ def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
     return unknown_flag(name, known)
 
 
-def _settings_file(path: str) -> Options:
+def read_settings(path: str) -> Any:
+    """What a settings.json holds, given as the file or as the folder of its run. UsageError for neither."""
     from tightrope.runs.records import read_json
 
     file = Path(path)
     file = file / "settings.json" if file.is_dir() else file
     if not file.is_file():
         raise UsageError(f"--settings {path}: there is no such file. Give RUN/settings.json.")
-    return values_from_json(read_json(file))
+    return read_json(file)
 
 
 def overrides(given: Options, file_values: Options) -> tuple[str, Options]:
@@ -265,3 +274,44 @@ def overrides(given: Options, file_values: Options) -> tuple[str, Options]:
             f"and never by a file: tightrope train {env} --settings ..."
         )
     return env, values
+
+
+def file_values(name: str, path: str | None, flags: Options) -> Options:
+    """What --settings of a language command says that no flag does, names and types checked; nothing without.
+
+    UsageError for the settings of another command, and for what a file cannot hold and no flag gives again:
+    an object, or code, which is named by the user alone.
+    """
+    from tightrope.language.settings import NOT_HERE, AlignSettings, RewardSettings, RLHFSettings, SFTSettings
+
+    if path is None:
+        return {}
+    kinds = {"sft": SFTSettings, "reward": RewardSettings, "align": AlignSettings}
+    data = read_settings(path)
+    if not isinstance(data, dict):
+        raise UsageError(f"--settings {path} holds {type(data).__name__}, expected an object with settings.")
+    own = next((command for command, field in OWN_FIELDS.items() if field in data), name)
+    if own != name:
+        raise UsageError(
+            f"--settings {path} holds the settings of {own}, expected those of {name}. Give settings.json "
+            f"of a run of {name}, or type: {PROGRAM} {own} --settings {path}"
+        )
+    inner = data.pop("update", {}) if name == "align" else {}
+    if not isinstance(inner, dict):
+        raise UsageError(f"--settings {path}: update is {inner!r}, expected an object with settings.")
+    values = typed_values(data, kinds[name])
+    values |= typed_values({key: x for key, x in inner.items() if key not in NOT_HERE}, RLHFSettings)
+    values = {key: x for key, x in values.items() if key not in flags}
+    for key, value in values.items():
+        if _must_be_named(key, value):
+            raise UsageError(
+                f"--settings {path}: {key} was {value!r}, which no file may name: an object, code, or a "
+                f"folder that is gone. Give it again: --{key.replace('_', '-')} ..."
+            )
+    return values
+
+
+def _must_be_named(key: str, value: Any) -> bool:
+    """Whether a setting stands for a Python object, or for code, which no file may name."""
+    judge = key in ("reward", "gold") and value not in (None, "", "length") and not Path(value).is_dir()
+    return judge or (isinstance(value, str) and value.startswith("<"))

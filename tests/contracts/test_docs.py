@@ -70,7 +70,7 @@ def run_command(line: str) -> None:
     if words[0] == "tightrope":
         train_for_real = words[1] == "train" and not {"--help", "--dry-run"} & set(words)
         more = TRAINING if train_for_real else RESUMING if words[1] == "resume" else []
-        code, printed = run(words[1:] + more)
+        code, printed = run(replaced(words[1:], more))
         assert code == 0, f"{line}\n{printed}"
         assert printed.strip(), f"{line} printed nothing"
     elif words[0] == "make":
@@ -84,6 +84,12 @@ def run_command(line: str) -> None:
         assert named is None or set(named.group(1).split(",")) <= set(extras), line
     else:
         raise AssertionError(f"no rule for this command: {line}")
+
+
+def replaced(words: list[str], more: list[str]) -> list[str]:
+    """A command with flags and values added, in place of those it gives itself."""
+    own = {i for i, word in enumerate(words) if word in more[::2]}
+    return [word for i, word in enumerate(words) if not {i, i - 1} & own] + more
 
 
 def run_console(text: str) -> None:

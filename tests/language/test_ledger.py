@@ -292,3 +292,68 @@ def test_control_groups_of_the_first_version(tmp_path: Path) -> None:
 
 def test_this_machine_says_something() -> None:
     assert available_memory("cpu") is None or available_memory("cpu") > 0
+
+
+def told(settings: AlignSettings, **given) -> tuple[Ledger, str]:
+    """The ledger that `make_roles` presents before it loads anything, and its text."""
+    from tightrope.language import roles
+
+    class Stop(Exception):
+        pass
+
+    seen: dict = {}
+
+    def hold(config, job):
+        seen["ledger"] = ledger(config, job)
+        return seen["ledger"]
+
+    def stop(text: str) -> None:
+        seen["text"] = text
+        raise Stop
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(roles, "ledger", hold)
+        roles.make_roles(settings, None, stop, **given)
+    return seen["ledger"], seen["text"]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> tuple[str, str, int]:
+    """A policy, a reward model of another size as `tightrope reward` leaves it, and that one's bytes."""
+    from transformers import AutoModelForSequenceClassification
+
+    top = tmp_path_factory.mktemp("models")
+    LLAMA.save_pretrained(top / "policy")
+    wide = LlamaConfig(**{**LLAMA.to_dict(), "hidden_size": 64, "head_dim": 16, "num_labels": 1})
+    model = AutoModelForSequenceClassification.from_config(wide)
+    model.to(torch.bfloat16).save_pretrained(top / "judge" / "model")
+    return str(top / "policy"), str(top / "judge"), size_of(model.float().parameters())
+
+
+def test_a_reward_model_and_a_gold_judge_count_by_their_own_size_in_float32(folders) -> None:
+    policy, judge, size = folders
+    settings = AlignSettings(model=policy, dtype="bfloat16", reward=judge, gold="length")
+    row = "reward model judge: weights"
+    assert entry(told(settings, own_reward=True)[0], row) == size
+    assert entry(told(AlignSettings(model=policy), judges=[judge])[0], row) == size
+    assert entry(told(AlignSettings(model=policy, gold=judge))[0], row) == size
+    found, text = told(settings, own_reward=True, judges=[judge, judge])
+    assert [entry.size for entry in found.rows if entry.what == row] == [size, size]
+    assert text.count(row) == 2 and "reward model: weights" not in text
+    assert (
+        "reward model" not in told(settings)[1]
+    )  # the reward lies on the trunk, the gold judge is a function
+
+
+def test_a_reward_model_that_is_not_known_is_taken_for_one_as_large_as_the_policy(folders) -> None:
+    settings = AlignSettings(model=folders[0], dtype="bfloat16", reward="<list>")
+    found = told(settings, own_reward=True)[0]
+    assert entry(found, "reward model: weights") == size_of(real(LLAMA).parameters()) + 4 * (32 + 1)
+
+
+def test_pretraining_texts_are_counted_for_every_row_of_a_micro_batch(folders) -> None:
+    usual = dict(model=folders[0], ptx_weight=1.0, ptx_data="x.txt", ptx_per_response=3,
+                 max_prompt_tokens=8, max_new_tokens=4, batch_size=16)  # fmt: skip
+    for update, rows in (({"micro_batch_size": 4}, 4), ({"minibatch_size": 8}, 8), ({}, 16)):
+        settings = AlignSettings().with_values(**usual, **update)
+        assert told(settings)[0].job.extra_tokens == rows * 3 * (8 + 4)

@@ -60,7 +60,6 @@ LANGUAGE = [
     "objective/truncated_fraction",
     "objective/masked_samples",
     "objective/distinct_2",
-    "objective/gold",
     "objective/gold_predicted_peak_kl",
     "objective/sampling_gap",
     "train/kl_loss",
@@ -80,6 +79,17 @@ LANGUAGE = [
     "reward/margin",
     "eval/gold",
 ]
+
+
+def test_a_metric_that_is_never_logged_is_not_declared() -> None:
+    """Gold scores are those of held-out prompts, eval/gold."""
+    assert "objective/gold" not in METRICS
+
+
+def test_the_tolerance_of_language_is_told_where_ratios_are_watched() -> None:
+    from tightrope.language.trainer import LOG_RATIO_LIMIT
+
+    assert f"language: up to {LOG_RATIO_LIMIT:g}" in METRICS["train/log_ratio_first"].doc
 
 
 def test_every_promised_name_is_declared() -> None:

@@ -195,10 +195,14 @@ def values_from_json(data: Any) -> dict[str, Any]:
     if not isinstance(inner, dict):
         raise ValueError(f"update is {inner!r}; expected an object with the settings of {algorithm}.")
     outer = {name: value for name, value in data.items() if name != "update"}
-    return _typed_values(outer, TrainSettings) | _typed_values(inner, ALGORITHM_SETTINGS[algorithm])
+    return typed_values(outer, TrainSettings) | typed_values(inner, ALGORITHM_SETTINGS[algorithm])
 
 
-def _typed_values(values: dict[str, Any], kind: type) -> dict[str, Any]:
+def typed_values(values: dict[str, Any], kind: type) -> dict[str, Any]:
+    """Values of a settings class as JSON holds them, by name, as the types of its fields.
+
+    Raises ValueError for an unknown name (with the nearest one) and for a value of another type.
+    """
     hints = get_type_hints(kind)
     for name in values:
         if name not in hints:

@@ -41,7 +41,9 @@ class Job:
     head, adapter, separate; ``reward``: none (a function), adapter, separate. With ``response_tokens`` 0
     nothing is sampled. ``rows_per_example``: 2 where pairs are compared. ``language_head`` False: no logits.
     ``extra_tokens``: tokens of a pretraining loss per micro-batch. ``keeps_float32``: where every weight is
-    trained, the weights stay float32 and ``dtype`` lowers copies of them for the arithmetic.
+    trained, the weights stay float32 and ``dtype`` lowers copies of them for the arithmetic. ``judges``: name
+    and bytes of every reward model with a trunk of its own; ``reward`` separate is one whose size is not
+    known, taken for as large as the policy, in float32.
     """
 
     tune: str = "lora"
@@ -61,6 +63,7 @@ class Job:
     language_head: bool = True
     extra_tokens: int = 0
     keeps_float32: bool = False
+    judges: tuple[tuple[str, int], ...] = ()
 
     @property
     def lowered(self) -> bool:
@@ -68,7 +71,13 @@ class Job:
         return self.keeps_float32 and self.tune == "full" and self.dtype != "float32"
 
 
-def job_of(settings: ModelSettings, *, reward: str = "none", extra_tokens: int = 0) -> Job:
+def job_of(
+    settings: ModelSettings,
+    *,
+    reward: str = "none",
+    extra_tokens: int = 0,
+    judges: tuple[tuple[str, int], ...] = (),
+) -> Job:
     """The job of a command's settings. ValueError for settings of another kind."""
     common: dict[str, Any] = {
         name: getattr(settings, name)
@@ -80,7 +89,7 @@ def job_of(settings: ModelSettings, *, reward: str = "none", extra_tokens: int =
             **common, critic=settings.critic, reward=reward, batch_size=settings.batch_size,
             micro_batch_size=min(rows, settings.batch_size), prompt_tokens=settings.max_prompt_tokens,
             response_tokens=settings.max_new_tokens, extra_tokens=extra_tokens,
-            keeps_exact_kl=settings.exact_in_loss,
+            keeps_exact_kl=settings.exact_in_loss, judges=judges,
         )  # fmt: skip
     if not isinstance(settings, SupervisedSettings):
         raise ValueError(f"{type(settings).__name__} is no job whose memory is known.")
@@ -171,7 +180,25 @@ def _roles(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
         yield Row(f"{role}: weights", head + (whole if job.critic == "separate" else own))
         yield from _trained(role, own + head)
     if job.reward != "none":
-        yield Row("reward model: weights", head + (whole if job.reward == "separate" else adapter))
+        own = FLOAT * shapes.parameters if job.reward == "separate" else adapter
+        yield Row("reward model: weights", head + own)
+    for name, size in job.judges:
+        yield Row(f"reward model {name}: weights", size)
+
+
+def reward_model_bytes(folder: Path) -> int:
+    """The weights of the reward model in this folder as `load_reward` loads them, in float32, from its own
+    config.json; 0 where there is none, which loading refuses.
+    """
+    from transformers import AutoConfig, AutoModel
+
+    path = folder / "model" if (folder / "model" / "config.json").is_file() else folder
+    if not (path / "config.json").is_file():
+        return 0
+    config = AutoConfig.from_pretrained(path)
+    with torch.device("meta"):
+        base = AutoModel.from_config(config)
+    return FLOAT * (sum(p.numel() for p in base.parameters()) + config.get_text_config().hidden_size)
 
 
 def _trained(role: str, size: int) -> Iterator[Row]:

@@ -9,7 +9,7 @@ reward     adapter "reward" and a head | a model of its own | a function of the 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language import lora
-from tightrope.language.ledger import available_memory, check, job_of, ledger
+from tightrope.language.ledger import available_memory, check, job_of, ledger, reward_model_bytes
 from tightrope.language.models import eos_ids, find_model, load_causal, load_tokenizer, parts
 from tightrope.language.settings import AlignSettings
 from tightrope.language.token_stats import Sampling
@@ -104,16 +104,20 @@ def make_roles(
     notify: Callable[[str], None] = print,
     *,
     own_reward: bool = False,
+    judges: Sequence[Path | str] = (),
 ) -> Roles:
     """Load and arrange the models. ``reward_adapter``: a reward model's adapter for this very trunk;
-    ``own_reward``: a reward model with a trunk of its own will stand beside them.
+    ``own_reward``: the reward is a model with a trunk of its own, which will stand beside them. ``judges``:
+    the folders of all that will, the gold judge's too; where none are given, those that the settings name.
 
     The memory ledger is handed to ``notify`` before anything large is loaded; what cannot fit is a
     ValueError.
     """
     folder, dtype, device = find_model(settings.model), getattr(torch, settings.dtype), settings.device
-    kind = "separate" if own_reward else "none" if reward_adapter is None else "adapter"
-    present_memory(folder, settings, kind, notify)
+    beside = [Path(judge) for judge in judges] or judges_of(settings, own_reward)
+    guessed = own_reward and not judges and not Path(settings.reward or "-").is_dir()
+    kind = "separate" if guessed else "none" if reward_adapter is None else "adapter"
+    present_memory(folder, settings, kind, notify, beside)
     tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
     stops, cut, reference, critic = eos_ids(model, tokenizer), 0, None, None
     if settings.tune == "lora":
@@ -140,12 +144,32 @@ def make_roles(
     return Roles(tokenizer, trunk, reference, critic, head, settings, sampling, stops)
 
 
-def present_memory(folder: str, settings: AlignSettings, reward: str, notify: Callable[[str], None]) -> None:
-    """Say what the job will take, and refuse it with advice when it cannot fit: before weights are loaded."""
+def judges_of(settings: AlignSettings, own_reward: bool) -> list[Path]:
+    """The folders of reward models that the settings name and that have a trunk of their own: the reward
+    where ``own_reward`` says so, the gold judge always.
+    """
+    named = [settings.reward if own_reward else None, settings.gold]
+    return [Path(name) for name in named if name and Path(name).is_dir()]
+
+
+def present_memory(
+    folder: str,
+    settings: AlignSettings,
+    reward: str,
+    notify: Callable[[str], None],
+    judges: Sequence[Path] = (),
+) -> None:
+    """Say what the job will take, and refuse it with advice when it cannot fit: before weights are loaded.
+
+    ``judges``: folders of reward models with a trunk of their own, each of any size.
+    """
     from transformers import AutoConfig
 
-    extra = settings.ptx_per_response * (settings.max_prompt_tokens + settings.max_new_tokens)
-    job = job_of(settings, reward=reward, extra_tokens=extra if settings.ptx_weight else 0)
+    rows = min(settings.update.micro_batch_size or settings.update.minibatch_size, settings.batch_size)
+    texts = rows * settings.ptx_per_response if settings.ptx_weight else 0
+    extra = texts * (settings.max_prompt_tokens + settings.max_new_tokens)
+    sizes = tuple((judge.resolve().name, reward_model_bytes(judge)) for judge in judges)
+    job = job_of(settings, reward=reward, extra_tokens=extra, judges=sizes)
     found = ledger(AutoConfig.from_pretrained(folder), job)
     notify(found.text())
     check(found, available_memory(settings.device))

@@ -272,10 +272,11 @@ RECIPES: dict[str, Recipe] = {
         {
             "kl_beta": 0.15, "kl_goal": 6.0, "kl_horizon": 10_000.0, "temperature": 0.7, "num_epochs": 4,
             "value_clip": 0.2, "value_weight": 0.1, "whiten_rewards": True, "critic": "head",
-            "max_new_tokens": 24,
+            "max_new_tokens": 24, "tune": "full",
             "ignore_eos": True, "learning_rate": 1e-5, "batch_size": 512, "minibatch_size": 512,
         },
-        "Ziegler et al. 2019, arXiv 1909.08593; lm-human-preferences, launch.py",
+        "Ziegler et al. 2019, arXiv 1909.08593; lm-human-preferences, launch.py; without the cut at the first "
+        "full stop, which is the reward's to make",
     ),
     "instructgpt": Recipe(
         {
@@ -284,7 +285,8 @@ RECIPES: dict[str, Recipe] = {
             "critic_learning_rate": 9e-6, "learning_rate_schedule": "constant", "ptx_weight": 27.8,
             "ptx_per_response": 8,
         },
-        "Ouyang et al. 2022, arXiv 2203.02155, appendix C",
+        "Ouyang et al. 2022, arXiv 2203.02155, appendix C; without the warm-up of the learning rate and the "
+        "moving average of the weights; needs --ptx-data",
     ),
     "nplus": Recipe(
         {
@@ -300,7 +302,8 @@ RECIPES: dict[str, Recipe] = {
             "critic": "separate", "critic_from_reward": True, "tune": "full", "learning_rate": 5e-7,
             "critic_learning_rate": 1.65e-6, "reward_clip": 10.0, "critic_warmup": 10,
         },
-        "Zheng et al. 2023, Secrets of RLHF I, arXiv 2307.04964",
+        "Zheng et al. 2023, Secrets of RLHF I, arXiv 2307.04964; without its normalisation of rewards by "
+        "running moments, its pretraining loss and its warm-up of the learning rate",
     ),
     "vapo": Recipe(
         {
@@ -309,6 +312,6 @@ RECIPES: dict[str, Recipe] = {
             "learning_rate": 1e-6, "critic_learning_rate": 2e-6, "samples_per_prompt": 16,
             "batch_size": 8192, "minibatch_size": 512, "num_epochs": 1,
         },
-        "Yue et al. 2025, VAPO, arXiv 2504.05118",
+        "Yue et al. 2025, VAPO, arXiv 2504.05118; without its language-modelling loss on correct responses",
     ),
 }  # fmt: skip

@@ -108,13 +108,6 @@ LANGUAGE_TABLE = (
         "that trains, over the tokens of this rollout: 0 up to rounding.",
     ),
     metric(
-        "objective/gold",
-        "score",
-        "up",
-        "Mean score of this rollout's responses by the gold judge, which the policy is not trained on.",
-        negative=True,
-    ),
-    metric(
         "objective/gold_predicted_peak_kl",
         "nats",
         "any",

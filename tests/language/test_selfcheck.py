@@ -1,0 +1,54 @@
+"""The doctor's checks of a language model: each can fail, in every precision."""
+
+import pytest
+import torch
+from language.tiny import saved
+
+from tightrope.language import selfcheck, trunk
+from tightrope.language.roles import Roles
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return saved(tmp_path_factory.mktemp("model"))
+
+
+def bad(folder: str, dtype: str = "float32") -> list[str]:
+    """What the doctor finds wrong."""
+    return [finding.what for finding in selfcheck.check_model(folder, dtype) if not finding.good]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_a_healthy_model_is_healthy_in_every_precision(folder, dtype):
+    assert bad(folder, dtype) == []
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_a_model_that_attends_to_padding_on_the_left_is_found(folder, dtype, monkeypatch):
+    """It is right where rows are padded on the right: no other check compares the two sides."""
+    real = trunk._run
+
+    def careless(base, mask, **inputs):
+        return real(base, torch.ones_like(mask), **inputs)
+
+    monkeypatch.setattr(trunk, "_run", careless)
+    assert "padding on the right and on the left are one" in bad(folder, dtype)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_a_policy_that_trains_at_another_temperature_is_found_in_every_precision(folder, dtype, monkeypatch):
+    """Hidden states of the training pass are 1.5 times too large: sampling and training are two policies."""
+    real, calls = Roles.policy_hidden, []
+
+    def warmer(self, tokens, mask, lower):
+        calls.append(1)
+        return real(self, tokens, mask, lower) * (1.5 if len(calls) > 1 else 1.0)
+
+    monkeypatch.setattr(Roles, "policy_hidden", warmer)
+    assert "every ratio is 1 before the first step" in bad(folder, dtype)
+
+    def always(self, tokens, mask, lower):
+        return real(self, tokens, mask, lower) * 1.5
+
+    monkeypatch.setattr(Roles, "policy_hidden", always)
+    assert "sampling and training agree" in bad(folder, dtype)
