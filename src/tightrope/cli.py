@@ -303,7 +303,7 @@ def main(words: list[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return _dispatch(words)
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
         if isinstance(error, BrokenPipeError):
             # whoever read our output is gone; Python must not try to flush to it on its way out
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

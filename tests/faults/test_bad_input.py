@@ -120,6 +120,10 @@ def test_unsupported_spaces_are_named(space):
         (["CartPole-v1", "--gamma", "1.5"], ["1.5", "<= 1"]),
         (["CartPole-v1", "--algorithm", "a2c", "--clip", "0.2"], ["clip", "a2c"]),
         (["CartPole-v1", "--engine", "fused", "--dual-clip", "3"], ["dual_clip"]),
+        (
+            ["CartPole-v1", "--learning-rate", "1e38", "--num-steps", "16", "--minibatch-size", "16"],
+            ["as before"],
+        ),
     ],
 )
 def test_a_users_mistake_exits_with_2_and_says_what_to_do(arguments, words, capsys, tmp_path):

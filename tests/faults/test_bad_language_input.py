@@ -67,8 +67,15 @@ GOOD = [{"prompt": text, "answer": text} for text in ("ab", "cd", "efg")]
         ([*GOOD, {"prompt": "  \n"}], "good", [], ["prompt of data[3] is empty"]),
         ([{"question": "ab"}], "good", [], ["data[0] has the columns: question; expected prompt"]),
         ([{"prompt": 3}], "good", [], ["prompt of data[0] is int"]),
+        (
+            [*GOOD, {"prompt": "ab\ud800"}],
+            "good",
+            [],
+            ["prompt of data[3] holds '\\ud800'", "take the row out"],
+        ),
         ([{"prompt": [{"role": "user", "content": "a"}]}], "good", [], ["no chat template"]),
         (GOOD, "good", ["--max-prompt-tokens", "95"], ["95", "context of 96 tokens", "Choose less"]),
+        (GOOD, "good", ["--learning-rate", "1e9"], ["The gradient holds a NaN", "learning rate"]),
         (GOOD, "raises", [], ["'raises' raised KeyError", "line 4 of mine.py"]),
         (GOOD, "hangs", ["--reward-timeout", "0.1"], ["last 3 batches", "'hangs' was not back after 0.1 s"]),
         (GOOD, "short", [], ["'short' returned 1 scores, expected a list of 8"]),
@@ -85,6 +92,7 @@ def test_a_mistake_exits_with_2_and_says_what_to_do(place, tmp_path, capsys, row
     assert run(place, tmp_path, rows, reward, *more) == 2
     error = capsys.readouterr().err
     assert all(word in error for word in words) and "Traceback" not in error, error
+    assert "on_error" not in error  # no option of the command line
     assert time.monotonic() - begin < 20
 
 

@@ -93,6 +93,8 @@ def test_lists_and_whatever_yields_rows():
 
     assert read_rows(Dataset()) == [{"text": "a"}, {"text": "b"}]
     assert read_rows(["a", {"text": "b"}]) == ["a", {"text": "b"}]
+    chats = [[{"role": "user", "content": "hi"}], [{"role": "user", "content": "ho"}]]
+    assert read_rows(chats) == [{"prompt": chat} for chat in chats]
     endless = ({"text": str(i)} for i in itertools.count())
     assert len(read_rows(endless, limit=3)) == 3
     row = {"text": "a"}
@@ -122,6 +124,9 @@ def test_a_dataset_is_read_by_its_id(monkeypatch):
         ("x.jsonl", '["a", 3]\n', r"\[0\] is list; expected a string or a dict"),
         ("x.json", '{"text": ["a"]}', "holds dict; expected a list"),
         ("x.json", "[1", "not readable as json"),
+        ("x.jsonl", '{"text": "a"}\n{"text": "b", "text": "c"}\n', r"x\.jsonl line 2 names 'text' twice"),
+        ("x.json", '[{"prompt": "a", "prompt": "b"}]', r"x\.json names 'prompt' twice; .* Rename one"),
+        ("x.csv", "a,b,a\n1,2,3\n", r"x\.csv line 1 names 'a' twice"),
         ("x.csv", "a,b\n1\n", "line 2 has more or fewer fields"),
         ("x.csv", "a,b\n1,2,3\n", "line 2 has more or fewer fields"),
         ("x.txt", "\n \n", "holds no rows"),
@@ -298,6 +303,11 @@ BAD_CHAT = [{"role": "user", "content": "a"}, {"role": "assistant", "content": "
         ({"review": "a", "label": 1}, r"data\[1\] has the columns: review, label; expected text, prompt and"),
         ({"prompt": "a", "completion": None}, r"has the columns: prompt; expected"),
         ({"messages": CHAT[2:]}, r"data\[1\] begins with an assistant turn"),
+        ({"text": "ab\ud800"}, r"text of data\[1\] holds '\\ud800' at character 2: half .* take the row out"),
+        (
+            {"messages": [{"role": "user", "content": "\udc80"}, CHAT[2]]},
+            r"chat of data\[1\] holds '\\udc80'",
+        ),
     ],
 )
 def test_a_bad_row_is_named(row, message):
@@ -407,6 +417,17 @@ def test_long_prompts_lose_their_beginning():
     assert made.decode(list(short.tokens)) == "<bos>abc" and short.shown == "abc"
 
 
+def test_a_long_chat_loses_its_beginning_and_is_said_to_be_shown_whole():
+    made, heard = chatml(), []
+    rows = [{"prompt": CHAT[:2]}, "abcdefghijklmno"]
+    chat, _ = read_prompts(rows, made, max_tokens=12, notify=heard.append)
+    assert made.decode(list(chat.tokens)) == "\n<bos>assistant." and chat.shown == CHAT[:2]
+    assert heard == [
+        "2 of 2 prompts have more than 12 tokens and lost their beginning, though 1 of them are chats, which "
+        "reward functions are shown whole. Raise max_prompt_tokens to keep them whole."
+    ]
+
+
 @pytest.mark.parametrize(
     ("row", "message"),
     [
@@ -414,6 +435,7 @@ def test_long_prompts_lose_their_beginning():
         ({"prompt": None, "text": "a"}, r"has the columns: text; expected prompt"),
         ({"prompt": []}, r"prompt of data\[1\] is empty"),
         ({"prompt": 5}, r"prompt of data\[1\] is int"),
+        ("\ud800", r"prompt of data\[1\] holds '\\ud800' at character 0"),
     ],
 )
 def test_a_bad_prompt_is_named(row, message):

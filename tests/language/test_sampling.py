@@ -68,6 +68,14 @@ def test_the_filler_and_the_amount_of_padding_change_nothing(make):
     torch.testing.assert_close(first.logp, second.logp, rtol=1e-4, atol=1e-5)
 
 
+def test_top_k_beyond_the_vocabulary_leaves_every_token():
+    model, (tokens, real) = tiny_llama(), prompts()
+    size = model.config.vocab_size
+    few, many = (sample(model, tokens, real, Sampling(top_k=k), uniforms(5, 8), EOS) for k in (size, 500))
+    assert many.support.shape == (5, 8, size) and torch.equal(few.support, many.support)
+    assert torch.equal(few.tokens, many.tokens) and torch.equal(few.logp, many.logp)
+
+
 def test_a_row_does_not_depend_on_its_neighbours():
     model = tiny_llama()
     tokens, real = prompts()

@@ -324,6 +324,7 @@ def test_threads_are_the_users_again_afterwards(tmp_path, folder):
         ({}, [{"review": "a"}], r"data\[0\] has the columns: review"),
         ({"tune": "lora", "lora_layers": 9}, FACTS, "lora_layers is 9, but the model has 3"),
         ({"data": "absent.jsonl"}, None, "no file 'absent.jsonl'"),
+        ({"device": "nowhere"}, FACTS, "device is 'nowhere', which cannot be used here .* Choose cpu"),
     ],
 )
 def test_what_cannot_work_is_said_before_anything_is_written(tmp_path, folder, values, data, message):
@@ -337,4 +338,5 @@ def test_long_rows_are_reported(tmp_path, folder):
     settings = settings_of(folder, max_tokens=5)
     train_sft(settings, data=FACTS, run_dir=tmp_path / "run", report=lambda *event: lines.append(event))
     said = [data["text"] for kind, data in lines if data.get("warning")]
-    assert said == ["warning: 8 of 8 rows have more than max_tokens 5 tokens and were cut."]
+    cut = "8 of 8 rows have more than max_tokens 5 tokens and were cut"
+    assert said == [f"warning: {cut}. Raise max_tokens to keep them whole."]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from tightrope.runs import checkpoint
 from tightrope.runs.checkpoint import CheckpointError
@@ -168,6 +169,16 @@ def test_a_save_that_fails_leaves_nothing(
 
     monkeypatch.setattr(where, fail)
     with pytest.raises(type(error)):
+        checkpoint.save(tmp_path / "c", tensors(), STATE)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_an_error_of_the_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_args: object, **_kwargs: object) -> None:
+        raise SafetensorError("No space left on device (os error 28)")
+
+    monkeypatch.setattr("safetensors.torch.save_file", fail)
+    with pytest.raises(OSError, match=r"c cannot be written \(No space left.* Make room on the disk"):
         checkpoint.save(tmp_path / "c", tensors(), STATE)
     assert list(tmp_path.iterdir()) == []
 

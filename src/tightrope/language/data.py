@@ -12,6 +12,7 @@ import json
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -60,9 +61,10 @@ def read_rows(source: Any, limit: int | None = None) -> list[Row]:
     """The first ``limit`` rows (None: all) of a dataset.
 
     ``source``: a .jsonl, .json (a list), .csv or .txt file (a string a line), the id of a dataset on the hub
-    (``id`` or ``id:split``; needs the package datasets), a list of strings or dicts, or anything that yields
-    dicts, as datasets.Dataset does. Strings stay strings. ValueError when there is nothing to read or a row
-    is neither string nor dict.
+    (``id`` or ``id:split``; needs the package datasets), a list of strings, dicts or message lists, or
+    anything that yields dicts, as datasets.Dataset does. Strings stay strings, and a list of messages is read
+    as ``{"prompt": messages}``. ValueError when there is nothing to read, a row is none of these, or a column
+    stands in a file's row or header twice.
     """
     name = str(source) if isinstance(source, str | Path) else "data"
     if isinstance(source, str | Path):
@@ -76,9 +78,12 @@ def read_rows(source: Any, limit: int | None = None) -> list[Row]:
         raise ValueError(f"{name} is {type(source).__name__}; expected a file, a dataset or a list of rows.")
     rows: list[Row] = []
     for number, row in enumerate(islice(source, limit)):
+        if isinstance(row, list) and row and all(isinstance(message, Mapping) for message in row):
+            row = {"prompt": row}
         if not isinstance(row, str | Mapping):
             raise ValueError(
-                f"{name}[{number}] is {type(row).__name__}; expected a string or a dict of columns."
+                f"{name}[{number}] is {type(row).__name__}; expected a string or a dict of columns, or a "
+                'list of messages like {"role": "user", "content": "Hello"}.'
             )
         rows.append(row if isinstance(row, str) else dict(row))
     if not rows:
@@ -96,7 +101,7 @@ def _read_file(path: Path) -> list[Any]:
                 return _table(file, path)
             lines = file.read().split("\n") if kind != ".json" else []
             if kind == ".json":
-                return _list(json.load(file), path)
+                return _list(json.load(file, object_pairs_hook=partial(_unique, str(path))), path)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not UTF-8 text ({error}). Convert it.") from error
     except (json.JSONDecodeError, csv.Error) as error:
@@ -109,11 +114,25 @@ def _read_file(path: Path) -> list[Any]:
 
 def _object(line: str, place: str) -> Any:
     try:
-        return json.loads(line)
+        return json.loads(line, object_pairs_hook=partial(_unique, place))
     except (json.JSONDecodeError, RecursionError) as error:
         raise ValueError(
             f"{place} is not JSON ({error}). Each line of a .jsonl file is one object."
         ) from error
+
+
+def _unique(place: str, pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of its pairs. ValueError for a key that is there twice: one of its values would be lost."""
+    _each_once([key for key, _ in pairs], place)
+    return dict(pairs)
+
+
+def _each_once(names: Sequence[str], place: str) -> None:
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(
+            f"{place} names {twice!r} twice; expected every column once. Rename one, or take it out."
+        )
 
 
 def _list(value: Any, path: Path) -> list[Any]:
@@ -124,6 +143,7 @@ def _list(value: Any, path: Path) -> list[Any]:
 
 def _table(file: Iterable[str], path: Path) -> list[Any]:
     reader, rows = csv.DictReader(file, strict=True), []
+    _each_once(list(reader.fieldnames or []), f"{path} line {reader.line_num}")
     for row in reader:
         if None in row or None in row.values():
             raise ValueError(f"{path} line {reader.line_num} has more or fewer fields than its header.")
@@ -215,10 +235,10 @@ def read_prompts(
 
     Messages end with the assistant's header, so that the response is its turn. Every other column goes to the
     reward functions. Prompts over ``max_tokens`` lose their beginning (the tokenizer's opening stays, and
-    ``shown`` is what is left), and ``notify`` is told how many. ValueError names a row that is empty or has
-    no prompt.
+    ``shown`` is what is left of a string; a chat is shown whole), and ``notify`` is told how many. ValueError
+    names a row that is empty or has no prompt.
     """
-    encoder, cut = Encoder(tokenizer), 0
+    encoder, cut, chats = Encoder(tokenizer), 0, 0
     prompts: list[Prompt] = []
     for number, row in enumerate(rows):
         columns, place = {"prompt": row} if isinstance(row, str) else row, f"data[{number}]"
@@ -232,14 +252,16 @@ def read_prompts(
         if not tokens:
             raise ValueError(f"prompt of {place} has no tokens. Take the row out, or fill it in.")
         if len(tokens) > max_tokens:
-            cut += 1
+            cut, chats = cut + 1, chats + (not isinstance(shown, str))
             tail = tokens[len(opening) - max_tokens :]
             tokens = [*opening, *tail]
             shown = tokenizer.decode(tail) if isinstance(shown, str) else shown
         others = {name: value for name, value in columns.items() if name != "prompt"}
         prompts.append(Prompt(tuple(tokens), shown, others))
     if cut:
-        notify(f"{cut} of {len(rows)} prompts have more than {max_tokens} tokens and lost their beginning.")
+        whole = f", though {chats} of them are chats, which reward functions are shown whole" if chats else ""
+        long = f"{cut} of {len(rows)} prompts have more than {max_tokens} tokens"
+        notify(f"{long} and lost their beginning{whole}. Raise max_prompt_tokens to keep them whole.")
     return prompts
 
 
@@ -256,7 +278,7 @@ def _tell(notify: Notify, rows: int, kept: int, cut: int, max_tokens: int, why: 
     if kept < rows:
         parts.append(f"{rows - kept} of {rows} rows have {why} and were left out")
     if parts:
-        notify("; ".join(parts) + ".")
+        notify("; ".join(parts) + "." + (" Raise max_tokens to keep them whole." if cut else ""))
 
 
 def pad_left(rows: Sequence[Sequence[int]], filler: int = 0) -> tuple[Tensor, Tensor]:

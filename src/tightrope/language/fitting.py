@@ -31,6 +31,7 @@ from tightrope.language.models import (
     find_model,
     load_causal,
     load_tokenizer,
+    require_device,
     without_dropout,
 )
 from tightrope.language.saving import Progress, load_progress, put_back, save_progress, tensors_of
@@ -67,8 +68,9 @@ def prepared(
     settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None, report: Reporter
 ) -> Iterator[Loaded]:
     """The model, ready to train inside: its memory told and found to fit before it is loaded, its adapter on,
-    the settings' threads at work.
+    the settings' threads at work. ValueError for a device that is not there.
     """
+    require_device(settings.device)
     with threads(settings.threads):
         present_memory(settings, given, report)
         loaded = load(settings, adapter, given)
@@ -95,8 +97,10 @@ def load(settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | No
     """Load the settings' model, or take a (model, tokenizer) that is given and train it in place.
 
     Tuned in full, the weights stay float32 whatever ``dtype`` says: a step of 1e-5 is lost on a bfloat16
-    weight; `precision` then lowers the arithmetic alone. ValueError when max_tokens exceeds the context.
+    weight; `precision` then lowers the arithmetic alone. ValueError when max_tokens exceeds the context, or
+    the device is not there.
     """
+    require_device(settings.device)
     if given is not None:
         source = given[0].name_or_path or settings.model
     else:

@@ -64,9 +64,10 @@ class Encoder:
                 "model that was made for chats."
             )
         try:
-            return str(self.tokenizer.apply_chat_template(messages, tokenize=False, **options))
+            text = str(self.tokenizer.apply_chat_template(messages, tokenize=False, **options))
         except Exception as error:  # whatever a template raises: it is a program of the model's authors
             raise ValueError(f"{place}: the chat template refuses these messages ({error}).") from error
+        return encodable(text, f"the chat of {place}")
 
     def chat(self, messages: Messages, place: str, *, first: int = 0, tools: Any = None) -> Pieces:
         """A chat in pieces; assistant turns from message ``first`` on are learnt, up to their EOS."""
@@ -189,7 +190,9 @@ def as_messages(value: str | Messages, role: str) -> Messages:
 
 
 def content(row: dict[str, Any], column: str, place: str) -> str | Messages:
-    """A string that is not blank or a list of messages. ValueError names the row and what is wrong."""
+    """A string of encodable text that is not blank, or a list of messages. ValueError names the row and what
+    is wrong.
+    """
     value = row[column]
     if not isinstance(value, str | list):
         kind = type(value).__name__
@@ -197,7 +200,7 @@ def content(row: dict[str, Any], column: str, place: str) -> str | Messages:
     if not value or (isinstance(value, str) and not value.strip()):
         raise ValueError(f"{column} of {place} is empty. Take the row out, or fill it in.")
     if isinstance(value, str):
-        return value
+        return encodable(value, f"{column} of {place}")
     for message in value:
         if not isinstance(message, dict) or not isinstance(message.get("role"), str):
             raise ValueError(
@@ -211,3 +214,16 @@ def content(row: dict[str, Any], column: str, place: str) -> str | Messages:
                 f"{column} of {place} has an empty {role} message. Take the row out, or fill it in."
             )
     return value
+
+
+def encodable(text: str, place: str) -> str:
+    """The text, where it is one: ValueError for half of a surrogate pair, which no tokenizer reads."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(
+            f"{place} holds {text[error.start]!r} at character {error.start}: half of a surrogate pair, "
+            "which is no text. It was cut or decoded wrongly: take the row out, or the character, with "
+            'text.encode("utf-8", "ignore").decode().'
+        ) from error
+    return text

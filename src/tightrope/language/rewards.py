@@ -219,8 +219,7 @@ class Rewards:
         faults = [Fault(f.function, f.kind, f.samples, f"Reward function {name!r} {f.text}") for f in faults]
         for fault in faults:
             if self.on_error == "raise" or (self.on_error is None and fault.kind in RAISES):
-                advice = " With on_error='mask' such responses are masked and counted instead."
-                raise RewardError(fault.text + advice) from error
+                raise RewardError(fault.text) from error
         return part, faults
 
     def _refuse_to_learn_nothing(self, scores: Scores) -> None:

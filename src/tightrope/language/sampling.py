@@ -21,7 +21,7 @@ class Responses:
     """B responses of at most R tokens: ``tokens`` and ``logp`` [B, R], ``mask`` [B, R] True for real tokens.
 
     ``ended`` [B]: the response closed itself with an EOS (which counts as a token of it). ``support``
-    [B, R, k]: the ids among which top-k drew, None without top-k.
+    [B, R, k]: the ids among which top-k drew, k at most the vocabulary; None without top-k.
     """
 
     tokens: Tensor
@@ -59,7 +59,7 @@ def sample(
     tokens = torch.zeros(rows, columns, dtype=torch.int64, device=device)
     mask = torch.zeros(rows, columns, dtype=torch.bool, device=device)
     logp = torch.zeros(rows, columns, device=device)
-    shape = (rows, columns, sampling.top_k)
+    shape = (rows, columns, min(sampling.top_k, len(head.weight)))  # as many as `draw` has to choose among
     support = torch.zeros(shape, dtype=torch.int64, device=device) if sampling.top_k else None
     ended = torch.zeros(rows, dtype=torch.bool, device=device)
     stops = torch.tensor(eos, device=device)

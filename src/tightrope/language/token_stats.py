@@ -17,7 +17,9 @@ CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 
 @dataclass(frozen=True)
 class Sampling:
-    """How tokens are drawn: temperature, the k likeliest alone (0: all), tokens that are never drawn."""
+    """How tokens are drawn: temperature, the k likeliest alone (0, or more than there are: all), tokens that
+    are never drawn.
+    """
 
     temperature: float = 1.0
     top_k: int = 0

@@ -8,6 +8,7 @@ with its size and SHA-256, and a folder that differs from its manifest in any wa
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import re
@@ -15,6 +16,7 @@ import shutil
 import stat
 import uuid
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,12 +68,27 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
     temporary = folder.with_name(f"{TEMPORARY}{folder.name}-{uuid.uuid4().hex[:8]}")
     temporary.mkdir()
     try:
-        _fill(temporary, tensors, state)
+        with writing(folder):
+            _fill(temporary, tensors, state)
         _put(temporary, folder)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     return folder
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Inside, what safetensors cannot write, on a full disk for one, is an OSError that names ``path``."""
+    from safetensors import SafetensorError
+
+    try:
+        yield
+    except SafetensorError as error:
+        raise OSError(
+            f"{path} cannot be written ({error}). Make room on the disk and try again; a run that has a "
+            "checkpoint goes on with: tightrope resume RUN"
+        ) from error
 
 
 def _fill(temporary: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, Any]) -> None:
