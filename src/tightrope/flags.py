@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
+from tightrope.algorithms.peer_names import PEER_NAMES
 from tightrope.algorithms.settings import range_text
-from tightrope.control.peer_names import PEER_NAMES
 
 WIDTH = 100
 
