@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Self
 
+from tightrope.algorithms.peer_names import PEER_NAMES
 from tightrope.algorithms.settings import PPOSettings, Schedule, check_ranges, setting
 
 Tune = Literal["lora", "full"]
@@ -238,7 +239,9 @@ class AlignSettings(ModelSettings):
         if unknown:
             import difflib
 
-            near = difflib.get_close_matches(unknown[0], known | outer, n=1)
+            peers = PEER_NAMES.get(unknown[0], "")
+            near = [peers] if peers in known | outer else []
+            near += difflib.get_close_matches(unknown[0], known | outer, n=1)
             hint = f" Did you mean {near[0]}?" if near else ""
             raise ValueError(f"align has no setting named {', '.join(unknown)}.{hint}")
         own["update"] = dataclasses.replace(own.get("update", self.update), **inner)
