@@ -109,6 +109,8 @@ def text(results: dict[str, Any]) -> str:
 
 def critics(results: dict[str, Any]) -> str:
     """Mean and 95 % interval over the seeds for each kind of critic."""
+    if not any(name.startswith("critic-") for name in results["runs"]):
+        return "Not measured yet."
     lines = ["| critic | score | gold gained | KL, nats | PPO, s |", "|---|---|---|---|---|"]
     for critic in CRITICS:
         runs = [found for name, found in results["runs"].items() if name.startswith(f"critic-{critic}")]

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.models import parts
+from tightrope.runs.checkpoint import writing
 
 
 class Switch:
@@ -260,8 +261,9 @@ def save_adapter(
         "inference_mode": True,
     }
     state = {key: tensor.cpu().contiguous().clone() for key, tensor in adapter_state(model, name).items()}
-    save_file(state, folder / "adapter_model.safetensors", metadata={"format": "pt"})
-    (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    with writing(folder):
+        save_file(state, folder / "adapter_model.safetensors", metadata={"format": "pt"})
+        (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
 
 
 def load_adapter(model: Any, name: str, folder: Path) -> None:

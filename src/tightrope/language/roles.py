@@ -19,7 +19,14 @@ from torch import Tensor, nn
 
 from tightrope.language import lora
 from tightrope.language.ledger import available_memory, check, job_of, ledger, reward_model_bytes
-from tightrope.language.models import eos_ids, find_model, load_causal, load_tokenizer, parts
+from tightrope.language.models import (
+    eos_ids,
+    find_model,
+    load_causal,
+    load_tokenizer,
+    parts,
+    require_device,
+)
 from tightrope.language.settings import AlignSettings
 from tightrope.language.token_stats import Sampling
 from tightrope.language.trunk import Trunk
@@ -113,6 +120,7 @@ def make_roles(
     The memory ledger is handed to ``notify`` before anything large is loaded; what cannot fit is a
     ValueError.
     """
+    require_device(settings.device)
     folder, dtype, device = find_model(settings.model), getattr(torch, settings.dtype), settings.device
     beside = [Path(judge) for judge in judges] or judges_of(settings, own_reward)
     guessed = own_reward and not judges and not Path(settings.reward or "-").is_dir()

@@ -39,8 +39,9 @@ def save_model(roles: Roles, path: Path, settings: AlignSettings) -> None:
 def write_model(model: Any, tokenizer: Any, folder: Path, adapter: str | None) -> None:
     """Any transformers model with one adapter folded in, and its tokenizer, as safetensors."""
     state = {key: tensor.cpu() for key, tensor in lora.merged_state(model, adapter).items()}
-    model.save_pretrained(folder, state_dict=state)
-    tokenizer.save_pretrained(folder)
+    with checkpoint.writing(folder):
+        model.save_pretrained(folder, state_dict=state)
+        tokenizer.save_pretrained(folder)
 
 
 Tensors = dict[str, dict[str, Tensor]]

@@ -278,8 +278,8 @@ RECIPES: dict[str, Recipe] = {
             "max_new_tokens": 24, "tune": "full",
             "ignore_eos": True, "learning_rate": 1e-5, "batch_size": 512, "minibatch_size": 512,
         },
-        "Ziegler et al. 2019, arXiv 1909.08593; lm-human-preferences, launch.py; without the cut at the first "
-        "full stop, which is the reward's to make",
+        "Ziegler et al. 2019, arXiv 1909.08593; lm-human-preferences, launch.py; without the cut at the "
+        "first full stop, which is the reward's to make",
     ),
     "instructgpt": Recipe(
         {
