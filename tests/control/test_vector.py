@@ -203,7 +203,8 @@ def alive(pid: int) -> bool:
 
 
 SCRIPT = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may start us with it ignored
 sys.path.insert(0, {here!r})
 import chain
 from tightrope.control.environments import make_environments
