@@ -95,7 +95,7 @@ class Rewards:
     ) -> None:
         pairs = [item if isinstance(item, tuple) else (item, 1.0) for item in functions]
         self.functions = [_checked_function(function) for function, _ in pairs]
-        self.weights = [_checked_weight(weight) for _, weight in pairs]
+        self.weights = [checked_weight(weight) for _, weight in pairs]
         self.names = _checked_names(self.functions, names)
         if timeout is not None and not 0 < timeout < math.inf:
             raise ValueError(f"timeout is {timeout}, expected seconds above 0, or None for no limit.")
@@ -249,7 +249,8 @@ def _checked_function(function: Any) -> RewardFunction:
     return function
 
 
-def _checked_weight(weight: Any) -> float:
+def checked_weight(weight: Any) -> float:
+    """The weight as a float. ValueError for what is no finite number."""
     value = None if isinstance(weight, str) else number(weight)
     if value is None or not math.isfinite(value):
         raise ValueError(f"The weight of a reward function is {weight!r}, expected a finite number.")

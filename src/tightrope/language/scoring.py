@@ -4,7 +4,6 @@ functions.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from tightrope.language.answers import Fault, RewardError
 from tightrope.language.collect import Experience
 from tightrope.language.data import Prompt
 from tightrope.language.reward_model import RewardModel, last_real, load_reward
-from tightrope.language.rewards import Rewards, Scores, load_reward_function, unlike
+from tightrope.language.rewards import Rewards, Scores, checked_weight, load_reward_function, unlike
 from tightrope.language.roles import Roles
 
 
@@ -120,13 +119,13 @@ def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) ->
 
 def is_folder(reward: Any) -> bool:
     """Whether a reward, or one of several, is the folder of a reward model."""
-    entries = (_bare(entry) for entry in _entries(reward))
+    entries = (_weighted(entry)[0] for entry in _entries(reward))
     return any(isinstance(entry, str | Path) and Path(entry).is_dir() for entry in entries)
 
 
 def reward_adapter(words: Any) -> Path | None:
     """The adapter folder of a reward model that was trained with LoRA, None for any other reward."""
-    for entry in map(_bare, _entries(words)):
+    for entry, _ in map(_weighted, _entries(words)):
         if isinstance(entry, str | Path) and (Path(entry) / "adapter" / "head.safetensors").is_file():
             return Path(entry) / "adapter"
     return None
@@ -175,12 +174,9 @@ def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: flo
 
 def _weighted(entry: Any) -> tuple[Any, float]:
     """A reward and its weight, 1 where none is given. ValueError for a weight that is no finite number."""
-    if not (isinstance(entry, tuple) and len(entry) == 2):
-        return entry, 1.0
-    reward, weight = entry
-    if isinstance(weight, bool) or not isinstance(weight, int | float) or not math.isfinite(weight):
-        raise ValueError(f"the weight of reward {reward!r} is {weight!r}; expected a finite number.")
-    return reward, float(weight)
+    if isinstance(entry, tuple) and len(entry) == 2:
+        return entry[0], checked_weight(entry[1])
+    return entry, 1.0
 
 
 def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:
@@ -208,7 +204,7 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
     policy's hidden states cannot read what the reward model's hidden states say. ValueError for what does not
     fit.
     """
-    folder = next((_bare(entry) for entry in _entries(reward) if is_folder(entry)), None)
+    folder = next((_weighted(entry)[0] for entry in _entries(reward) if is_folder(entry)), None)
     kind, head = roles.settings.critic, roles.critic_head
     if folder is None or head is None or kind == "head" or (kind == "adapter" and judge.adapter is None):
         raise ValueError(
@@ -234,11 +230,6 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
     with torch.no_grad():
         head.weight.copy_(weight)
         head.bias.fill_(-shift)
-
-
-def _bare(entry: Any) -> Any:
-    """A reward without its weight."""
-    return entry[0] if isinstance(entry, tuple) and len(entry) == 2 else entry
 
 
 def _entries(reward: Any) -> list[Any]:
