@@ -49,12 +49,12 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
             "lora_layers": 10,
         },
         "reward": {
-            "max_tokens": 48, "max_examples": 3000, "minibatch_size": 16, "learning_rate": 5e-4,
+            "max_tokens": 48, "max_examples": 4000, "minibatch_size": 16, "learning_rate": 5e-4,
             "lora_layers": 10, "dtype": "bfloat16",
         },
         "align": {
-            "total_episodes": 4096, "batch_size": 64, "minibatch_size": 16, "learning_rate": 5e-4,
-            "kl_beta": 0.05, "lora_rank": 16, "lora_layers": 10, "dtype": "bfloat16",
+            "total_episodes": 3584, "batch_size": 64, "minibatch_size": 16, "learning_rate": 3e-4,
+            "kl_beta": 0.1, "lora_rank": 16, "lora_layers": 10, "dtype": "bfloat16",
             "evaluate_every": 0.1, "held_out_prompts": 48,
         },
     },
@@ -80,10 +80,11 @@ def reviews() -> list[tuple[str, int]]:
 
 
 def window(text: str, words: int, rng: random.Random) -> str:
-    """A stretch of a review: from the beginning of a sentence, or its end, where the verdict stands."""
+    """A stretch of a review from the beginning of a sentence.
+
+    Never its end: names and ratings stand there, and a reward model that has seen them pays for capitals.
+    """
     pieces = text.split()
-    if rng.random() < 0.5:
-        return " ".join(pieces[-words:])
     starts = [0, *(i + 1 for i, word in enumerate(pieces[:-words]) if word.endswith((".", "!", "?")))]
     start = rng.choice(starts)
     return " ".join(pieces[start : start + words])
