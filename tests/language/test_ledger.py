@@ -185,7 +185,7 @@ def test_supervised_jobs_hold_one_model_and_sample_nothing() -> None:
     assert not absent & {name.split(":")[0] for name in names}
     single = ledger(LLAMA, job_of(SFTSettings(minibatch_size=4)))
     pairs = ledger(LLAMA, job_of(RewardSettings(minibatch_size=4)))
-    what = "policy: activations of a micro-batch"
+    what = "model: activations of a micro-batch"
     assert entry(pairs, what) == 2 * entry(single, what)
     names = {row.what for row in pairs.rows}
     assert "logits of one chunk" not in names and "score head: weights" in names
@@ -196,8 +196,8 @@ def test_weights_that_are_trained_in_full_stay_float32_beside_their_lowered_copi
     """What load() does: --dtype bfloat16 is no saving there, and is not advised."""
     model = real(config)
     found = ledger(config, job_of(SFTSettings(tune="full", dtype="bfloat16")))
-    assert entry(found, "policy: weights of the trunk") == size_of(model.parameters())
-    lowered = entry(found, "policy: copies of its weights in bfloat16")
+    assert entry(found, "model: weights of the trunk") == size_of(model.parameters())
+    lowered = entry(found, "model: copies of its weights in bfloat16")
     assert lowered == size_of(p for p in parts(model).layers.parameters() if p.dim() == 2) / 2
     with pytest.raises(DoesNotFit) as caught:
         check(ledger(config, job_of(SFTSettings(tune="full"))), 1000)
@@ -206,7 +206,7 @@ def test_weights_that_are_trained_in_full_stay_float32_beside_their_lowered_copi
 
 def test_a_reward_model_does_not_train_the_language_head() -> None:
     found = ledger(LLAMA, job_of(RewardSettings(tune="full")))
-    assert entry(found, "policy: gradients") == size_of(parts(real(LLAMA)).base.parameters())
+    assert entry(found, "model: gradients") == size_of(parts(real(LLAMA)).base.parameters())
 
 
 def test_a_job_that_fits_passes_and_one_that_does_not_is_told_what_helps() -> None:
@@ -335,9 +335,8 @@ def test_a_reward_model_and_a_gold_judge_count_by_their_own_size_in_float32(fold
     settings = AlignSettings(model=policy, dtype="bfloat16", reward=judge, gold="length")
     row = "reward model judge: weights"
     assert entry(told(settings, own_reward=True)[0], row) == size
-    assert entry(told(AlignSettings(model=policy), judges=[judge])[0], row) == size
     assert entry(told(AlignSettings(model=policy, gold=judge))[0], row) == size
-    found, text = told(settings, own_reward=True, judges=[judge, judge])
+    found, text = told(dataclasses.replace(settings, gold=judge), own_reward=True)
     assert [entry.size for entry in found.rows if entry.what == row] == [size, size]
     assert text.count(row) == 2 and "reward model: weights" not in text
     assert (

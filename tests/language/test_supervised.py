@@ -209,7 +209,7 @@ def test_memory_is_told_first_and_a_job_that_cannot_fit_loads_nothing(tmp_path, 
     settings, events = kind(model=folder, tune="full", **FAST), []
     train(settings, data=data, run_dir=tmp_path / "run", report=lambda *event: events.append(event))
     said = next(found["text"] for event, found in events if event == "line")
-    assert events[0][0] == "line" and "policy: Adam's two moments" in said and "memory at the peak" in said
+    assert events[0][0] == "line" and "model: Adam's two moments" in said and "memory at the peak" in said
     loaded = []
     monkeypatch.setattr(fitting, "available_memory", lambda device: 1000)
     monkeypatch.setattr(fitting, "load_causal", lambda *arguments: loaded.append(arguments))

@@ -66,6 +66,11 @@ class Job:
     judges: tuple[tuple[str, int], ...] = ()
 
     @property
+    def trained(self) -> str:
+        """What the model is called: a policy has a reference beside it."""
+        return "policy" if self.reference else "model"
+
+    @property
     def lowered(self) -> bool:
         """Whether a forward pass makes copies of float32 weights in a lower precision."""
         return self.keeps_float32 and self.tune == "full" and self.dtype != "float32"
@@ -166,14 +171,15 @@ def ledger(config: Any, job: Job) -> Ledger:
 def _roles(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
     """Weights, gradients and moments."""
     whole, head = shapes.item * shapes.parameters, FLOAT * (shapes.hidden + 1)
+    who = job.trained
     adapter = FLOAT * shapes.adapter(job.lora_rank, adapted)
-    yield Row("policy: weights of the trunk", whole)
+    yield Row(f"{who}: weights of the trunk", whole)
     if job.tune == "lora":
-        yield Row("policy: weights of its adapter", adapter)
+        yield Row(f"{who}: weights of its adapter", adapter)
     elif job.reference:
         yield Row("reference: a frozen copy", whole)
     learnt = whole if job.language_head else shapes.item * shapes.base
-    yield from _trained("policy", learnt if job.tune == "full" else adapter)
+    yield from _trained(who, learnt if job.tune == "full" else adapter)
     if job.critic != "none":
         own = {"head": 0, "adapter": adapter, "separate": shapes.item * shapes.base}[job.critic]
         role = "critic" if job.language_head else "score head"
@@ -221,14 +227,15 @@ def _update(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
         inputs = shapes.item * shapes.hidden * count * share  # of every layer, and one layer at a time
         return int(tokens * (inputs + shapes.saved / count))
 
-    yield Row("policy: activations of a micro-batch", activations(tokens + job.extra_tokens, share), "update")
+    kept = activations(tokens + job.extra_tokens, share)
+    yield Row(f"{job.trained}: activations of a micro-batch", kept, "update")
     if job.critic in ("adapter", "separate"):
         own = 1.0 if job.critic == "separate" else share
         yield Row("critic: activations of a micro-batch", activations(tokens, own), "update")
     yield Row("one layer at work", tokens * shapes.saved // count, "update")
     if job.lowered:
         numbers = sum(a * b for layer in shapes.linears for a, b in layer)
-        yield Row(f"policy: copies of its weights in {job.dtype}", 2 * numbers, "update")
+        yield Row(f"{job.trained}: copies of its weights in {job.dtype}", 2 * numbers, "update")
     if job.language_head:
         chosen = rows * job.response_tokens or tokens
         logits = min(chosen * shapes.vocabulary, max(CHUNK, shapes.vocabulary))

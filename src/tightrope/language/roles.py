@@ -111,19 +111,17 @@ def make_roles(
     notify: Callable[[str], None] = print,
     *,
     own_reward: bool = False,
-    judges: Sequence[Path | str] = (),
 ) -> Roles:
     """Load and arrange the models. ``reward_adapter``: a reward model's adapter for this very trunk;
-    ``own_reward``: the reward is a model with a trunk of its own, which will stand beside them. ``judges``:
-    the folders of all that will, the gold judge's too; where none are given, those that the settings name.
+    ``own_reward``: the reward is a model with a trunk of its own, which will stand beside them.
 
     The memory ledger is handed to ``notify`` before anything large is loaded; what cannot fit is a
     ValueError.
     """
     require_device(settings.device)
     folder, dtype, device = find_model(settings.model), getattr(torch, settings.dtype), settings.device
-    beside = [Path(judge) for judge in judges] or judges_of(settings, own_reward)
-    guessed = own_reward and not judges and not Path(settings.reward or "-").is_dir()
+    beside = judges_of(settings, own_reward)
+    guessed = own_reward and not Path(settings.reward or "-").is_dir()
     kind = "separate" if guessed else "none" if reward_adapter is None else "adapter"
     present_memory(folder, settings, kind, notify, beside)
     tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
