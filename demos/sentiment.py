@@ -59,6 +59,9 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
 }  # fmt: skip
+# The end of a review says clearly what was thought of the film, which the tiny model needs. Names and ratings
+# stand there too: a larger model finds out that a reward model which has seen them pays for capitals.
+ENDS = {"glassllm": 0.5, "smollm2": 0.0}
 JUDGED = 512  # responses before and after
 RESPONSES = {"max_new_tokens": 24, "max_prompt_tokens": 24, "ignore_eos": True, "critic_learning_rate": 1e-2}
 
@@ -79,12 +82,11 @@ def reviews() -> list[tuple[str, int]]:
     return found
 
 
-def window(text: str, words: int, rng: random.Random) -> str:
-    """A stretch of a review from the beginning of a sentence.
-
-    Never its end: names and ratings stand there, and a reward model that has seen them pays for capitals.
-    """
+def window(text: str, words: int, ends: float, rng: random.Random) -> str:
+    """A stretch of a review from the beginning of a sentence; with probability ``ends`` its end instead."""
     pieces = text.split()
+    if ends and rng.random() < ends:
+        return " ".join(pieces[-words:])
     starts = [0, *(i + 1 for i, word in enumerate(pieces[:-words]) if word.endswith((".", "!", "?")))]
     start = rng.choice(starts)
     return " ".join(pieces[start : start + words])
@@ -107,13 +109,13 @@ def gold_judge(rows: list[tuple[str, int]]) -> Any:
     return gold
 
 
-def pairs(rows: list[tuple[str, int]], words: int, count: int) -> list[dict[str, str]]:
+def pairs(rows: list[tuple[str, int]], words: int, ends: float, count: int) -> list[dict[str, str]]:
     """A stretch of a good review is preferred to one of a bad review."""
     rng = random.Random(2)
     good, bad = ([text for text, label in rows if label == wanted] for wanted in (1, 0))
 
     def draw(texts: list[str]) -> str:
-        return window(rng.choice(texts), words, rng)
+        return window(rng.choice(texts), words, ends, rng)
 
     return [{"chosen": draw(good), "rejected": draw(bad)} for _ in range(count)]
 
@@ -150,7 +152,7 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     earlier = options.stages or out
     stages = STAGES[options.model]
     model = _sft(earlier, for_reward, options.model, stages["sft"])
-    reward = _reward(earlier, model, for_reward, stages["reward"])
+    reward = _reward(earlier, model, for_reward, ENDS[options.model], stages["reward"])
     values = {**RESPONSES, **stages["align"], "seed": options.seed, "critic": options.critic}
     values |= {"threads": options.threads} | (
         {"total_episodes": options.episodes} if options.episodes else {}
@@ -178,14 +180,14 @@ def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, A
 
         print("\n1. Supervised fine-tuning: the language of film reviews")
         rng = random.Random(4)
-        texts = [{"text": window(text, 26, rng)} for text, _ in rows for _ in range(3)]
+        texts = [{"text": window(text, 26, ENDS[model], rng)} for text, _ in rows for _ in range(3)]
         settings = SFTSettings(model=model, data="film reviews", seed=0, **values)
         with _display(SFT, "steps") as display:
             train_sft(settings, data=texts, run_dir=out / "sft", report=display)
     return str(out / "sft" / "model")
 
 
-def _reward(out: Path, model: str, rows: list[tuple[str, int]], values: dict[str, Any]) -> str:
+def _reward(out: Path, model: str, rows: list[tuple[str, int]], ends: float, values: dict[str, Any]) -> str:
     """Stage two: which of two texts is the better one."""
     if not (out / "reward" / "summary.json").exists():
         from tightrope.language.display import REWARD
@@ -194,7 +196,7 @@ def _reward(out: Path, model: str, rows: list[tuple[str, int]], values: dict[str
 
         print("\n2. Reward model: a stretch of praise is preferred to one of blame")
         settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **values)
-        data = pairs(rows, 24, values["max_examples"])
+        data = pairs(rows, 24, ends, values["max_examples"])
         with _display(REWARD, "steps") as display:
             train_reward(settings, data=data, run_dir=out / "reward", report=display)
     return str(out / "reward")
