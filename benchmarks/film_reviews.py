@@ -37,7 +37,7 @@ JOBS: dict[str, tuple[str, ...]] = {
     "beta-0.02": ("--seed", "46", "--kl-beta", "0.02"),
     "beta-0.06": ("--seed", "51", "--kl-beta", "0.06"),
     "beta-0.1": ("--seed", "41", "--kl-beta", "0.1"),
-    "smollm2": ("--seed", "21", "--model", "smollm2"),
+    "smollm2": ("--seed", "71", "--model", "smollm2"),
     **{
         f"critic-{critic}-{seed}": ("--seed", str(seed), "--critic", critic, "--episodes", str(SHORT))
         for seed in SEEDS
