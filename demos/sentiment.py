@@ -63,7 +63,11 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
 # stand there too: a larger model finds out that a reward model which has seen them pays for capitals.
 ENDS = {"glassllm": 0.5, "smollm2": 0.0}
 JUDGED = 512  # responses before and after
-RESPONSES = {"max_new_tokens": 24, "max_prompt_tokens": 24, "ignore_eos": True, "critic_learning_rate": 1e-2}
+# Lambda 1: one score at the end of 24 tokens, and a critic that is still young when most is learnt.
+RESPONSES = {
+    "max_new_tokens": 24, "max_prompt_tokens": 24, "ignore_eos": True, "critic_learning_rate": 1e-2,
+    "gae_lambda": 1.0,
+}  # fmt: skip
 
 
 def reviews() -> list[tuple[str, int]]:
