@@ -38,8 +38,8 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
             "tune": "full",
         },
         "align": {
-            "total_episodes": 11_264, "batch_size": 128, "minibatch_size": 32, "learning_rate": 1e-3,
-            "kl": "exact-split", "kl_beta": 0.075, "lora_rank": 32, "lora_layers": 2, "evaluate_every": 0.025,
+            "total_episodes": 7168, "batch_size": 128, "minibatch_size": 32, "learning_rate": 1e-3,
+            "kl_beta": 0.1, "lora_rank": 32, "lora_layers": 2, "evaluate_every": 0.025,
             "held_out_prompts": 256,
         },
     },
