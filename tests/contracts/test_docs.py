@@ -4,7 +4,8 @@ What happens to a fenced block, by its language:
 
     python   begins with `# src/...`  must stand in that file, line for line, whatever the indentation
              holds `>>>`              is run by doctest; the answers must be those on the page
-             else                     is run as it stands, after the blocks before it on the page
+             else                     is run as it stands, after the blocks before it on the page; at
+                                      path/to/model lies a tiny one, and 4096 episodes become 64
     sh       tightrope ...            is run; TRAINING is added to train, and RESUMING to resume, so that
                                       it takes seconds
              make TARGET              the Makefile must have the target (to run it would run this test again)
@@ -112,7 +113,13 @@ def run_python(block: Block, page: Path, names: dict[str, Any]) -> None:
         assert result.failed == 0, printed.getvalue()
         return
     padding = "\n" * (block.line - 1)  # so that a traceback names the line of the page
-    exec(compile(padding + block.text, str(page), "exec"), names)
+    text = block.text
+    if "path/to/model" in text:
+        from language.tiny import saved, tiny_llama
+
+        saved(Path("path/to/model"), tiny_llama())
+        text = text.replace("total_episodes=4096", "total_episodes=64")  # the length alone is another
+    exec(compile(padding + text, str(page), "exec"), names)
 
 
 def stands_in(quoted: str, text: str) -> bool:
