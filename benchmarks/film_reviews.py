@@ -39,7 +39,7 @@ JOBS: dict[str, tuple[str, ...]] = {
         for seed in SEEDS
         for critic in CRITICS
     },
-    "smollm2": ("--seed", "71", "--model", "smollm2"),
+    "smollm2": ("--seed", "72", "--model", "smollm2"),
 }
 
 

@@ -54,7 +54,7 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
         },
         "align": {
             "total_episodes": 3584, "batch_size": 64, "minibatch_size": 16, "learning_rate": 3e-4,
-            "kl_beta": 0.1, "lora_rank": 16, "lora_layers": 10, "dtype": "bfloat16",
+            "kl_beta": 0.05, "lora_rank": 16, "lora_layers": 10, "dtype": "bfloat16",
             "evaluate_every": 0.1, "held_out_prompts": 48,
         },
     },
