@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors import SafetensorError
+from safetensors.torch import load_file
 
-from tightrope.runs import checkpoint
+from tightrope.runs import checkpoint, history
 from tightrope.runs.checkpoint import CheckpointError
+from tightrope.runs.durable import TEMPORARY, CannotWrite, remove_leftovers, writing
+from tightrope.runs.tensors import content
 
 
 def tensors() -> dict[str, dict[str, torch.Tensor]]:
@@ -77,9 +83,16 @@ def truncate(folder: Path) -> None:
 def rewrite_manifest(**changes: object):  # a manifest that agrees with the folder in everything but these
     def damage(folder: Path) -> None:
         path = folder / "manifest.json"
-        path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+        path.write_bytes(checkpoint._manifest_text({**json.loads(path.read_text()), **changes}))
 
     return damage
+
+
+def rewrite_plain(folder: Path, **changes: object) -> None:
+    """A manifest that is changed and keeps the hash it had."""
+    path = folder / "manifest.json"
+    manifest = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({k: v for k, v in manifest.items() if v is not None}, indent=2) + "\n")
 
 
 def swap_for_link(folder: Path) -> None:
@@ -99,7 +112,7 @@ def declare(name: str):
         path = folder / "manifest.json"
         manifest = json.loads(path.read_text())
         manifest["files"][name] = manifest["files"]["policy.safetensors"]
-        path.write_text(json.dumps(manifest))
+        path.write_bytes(checkpoint._manifest_text(manifest))
 
     return damage
 
@@ -124,6 +137,28 @@ DAMAGES = {
     "no files": (rewrite_manifest(files=[]), "manifest.json", "state.json"),
     "file entry is a number": (rewrite_manifest(files={"state.json": 3}), "checkpoint", ""),
     "newer version": (rewrite_manifest(version=99), "manifest.json", "99"),
+    "older version": (rewrite_manifest(version=1), "manifest.json", "reads 2"),
+    "another step": (rewrite_manifest(step=601), "manifest.json", "of step 601"),
+    "manifest without its hash": (
+        lambda f: rewrite_plain(f, sha256=None),
+        "manifest.json",
+        "its own SHA-256",
+    ),
+    "manifest with another hash": (
+        lambda f: rewrite_plain(f, step=600.0),
+        "manifest.json",
+        "its own SHA-256",
+    ),
+    "manifest with a space more": (
+        lambda f: (f / "manifest.json").write_text((f / "manifest.json").read_text() + " "),
+        "manifest.json",
+        "its own SHA-256",
+    ),
+    "manifest too deep": (
+        lambda f: rewrite_plain(f, deep=json.loads("[" * 900 + "]" * 900)),
+        "manifest.json",
+        "",
+    ),
     "another format": (rewrite_manifest(format="zip"), "manifest.json", "manifest of"),
 }
 
@@ -159,7 +194,7 @@ def test_file_stems_are_plain_names(tmp_path: Path, stem: str) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("where", ["safetensors.torch.save_file", "os.fsync", "os.rename"])
+@pytest.mark.parametrize("where", ["os.write", "os.fsync", "os.rename", "os.mkdir"])
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
 def test_a_save_that_fails_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, error: BaseException
@@ -168,26 +203,101 @@ def test_a_save_that_fails_leaves_nothing(
         raise error
 
     monkeypatch.setattr(where, fail)
-    with pytest.raises(type(error)):
+    with pytest.raises(CannotWrite if isinstance(error, OSError) else type(error)):
         checkpoint.save(tmp_path / "c", tensors(), STATE)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_an_error_of_the_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_args: object, **_kwargs: object) -> None:
-        raise SafetensorError("No space left on device (os error 28)")
+@pytest.mark.parametrize(
+    ("cause", "number", "advice"),
+    [
+        (OSError(28, "No space left on device"), 28, "Make room on the disk"),
+        (OSError(30, "Read-only file system"), 30, "read-only"),
+        (PermissionError(13, "Permission denied"), 13, "permission"),
+        (SafetensorError("No space left on device (os error 28)"), 28, "Make room on the disk"),
+    ],
+)
+def test_what_the_disk_refuses_is_said_with_the_path_and_what_to_do(
+    tmp_path: Path, cause: Exception, number: int, advice: str
+) -> None:
+    with pytest.raises(CannotWrite) as error, writing(tmp_path / "c"):
+        raise cause
+    assert isinstance(error.value, OSError) and error.value.errno == number
+    assert f"{tmp_path / 'c'} cannot be written" in str(error.value)
+    assert advice in str(error.value) and str(cause.args[-1]) in str(error.value)
 
-    monkeypatch.setattr("safetensors.torch.save_file", fail)
-    with pytest.raises(OSError, match=r"c cannot be written \(No space left.* Make room on the disk"):
-        checkpoint.save(tmp_path / "c", tensors(), STATE)
-    assert list(tmp_path.iterdir()) == []
+
+def test_the_manifest_says_what_it_was_written_with(folder: Path) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert set(manifest) == {
+        "format", "version", "step", "files", "versions", "settings_sha256", "sha256"
+    }  # fmt: skip
+    for name, entry in manifest["files"].items():
+        content = (folder / name).read_bytes()
+        assert entry == {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    assert manifest["versions"]["torch"] == torch.__version__
+    assert set(manifest["versions"]) >= {"python", "tightrope", "torch"}
+    own = {name: value for name, value in manifest.items() if name != "sha256"}
+    text = json.dumps(own, sort_keys=True, separators=(",", ":")).encode()
+    assert manifest["sha256"] == hashlib.sha256(text).hexdigest()
+    assert manifest["settings_sha256"] is None  # there are none in this state
+
+
+def test_the_settings_have_a_hash_of_their_own(tmp_path: Path) -> None:
+    settings = {"seed": 1, "clip": 0.2, "name": "Grüße"}
+    folder = checkpoint.save(tmp_path / "c", {}, {"settings": settings})
+    text = json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()
+    wanted = hashlib.sha256(text).hexdigest()
+    assert checkpoint.read_manifest(folder)["settings_sha256"] == wanted
+
+
+def test_a_manifest_imports_no_library(tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom tightrope.runs import checkpoint\n"
+        f"checkpoint.save(Path({str(tmp_path / 'c')!r}), {{}}, {{}})\n"
+        "assert not {'torch', 'gymnasium', 'transformers'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert set(checkpoint.read_manifest(tmp_path / "c")["versions"]) <= {"python", "tightrope", "numpy"}
+
+
+def test_other_versions_are_told(folder: Path) -> None:
+    assert checkpoint.changed_versions(folder) == ""
+    versions = {**checkpoint.versions(), "torch": "1.0"}
+    rewrite_manifest(versions=versions)(folder)
+    assert checkpoint.changed_versions(folder) == f"torch 1.0 (now {torch.__version__})"
+
+
+DTYPES = [
+    torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32,
+    torch.uint64, torch.float16, torch.bfloat16, torch.float32, torch.float64,
+]  # fmt: skip
+
+
+def test_every_reader_of_safetensors_reads_ours(tmp_path: Path) -> None:
+    """The same tensors as the library's own writer, of every dtype and shape, views and empty ones too."""
+    random = torch.Generator().manual_seed(0)
+    wanted = {}
+    for dtype in DTYPES:
+        name, numbers = str(dtype), torch.randint(0, 2, (3, 4), generator=random)
+        values = numbers.to(dtype)
+        wanted |= {f"{name} matrix": values, f"{name} view": values.T, f"{name} none": values[:0]}
+        wanted |= {f"{name} scalar": values[1, 2], f"{name} column": values[:, 1]}
+    (tmp_path / "x.safetensors").write_bytes(b"".join(content(wanted)))
+    read = load_file(tmp_path / "x.safetensors")
+    assert set(read) == set(wanted)
+    for name, tensor in wanted.items():
+        assert read[name].dtype == tensor.dtype and read[name].shape == tensor.shape
+        assert torch.equal(read[name], tensor)
+    with pytest.raises(ValueError, match="z is a tensor of complex64"):
+        list(content({"z": torch.zeros(1, dtype=torch.complex64)}))
 
 
 def test_a_failed_replacement_keeps_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = checkpoint.save(tmp_path / "best", {}, {"step": 1})
     with monkeypatch.context() as patch:
         patch.setattr(
-            "tightrope.runs.checkpoint.write_json", lambda *_: (_ for _ in ()).throw(OSError("disk full"))
+            "tightrope.runs.checkpoint.write_file", lambda *_: (_ for _ in ()).throw(OSError("disk full"))
         )
         with pytest.raises(OSError, match="disk full"):
             checkpoint.save(folder, {}, {"step": 2})
@@ -222,29 +332,35 @@ def test_a_crash_between_the_two_renames_loses_nothing(
 def test_newest_is_the_newest_valid_one(tmp_path: Path) -> None:
     for step in (100, 900, 1000):
         checkpoint.save(checkpoint.step_folder(tmp_path, step), tensors(), {"step": step})
-    (tmp_path / f"{checkpoint.TEMPORARY}step-000000002000-0").mkdir()
+    (tmp_path / f"{TEMPORARY}step-000000002000-0").mkdir()
     (tmp_path / "step-99").mkdir()
-    assert checkpoint.newest(tmp_path).name == "step-000000001000"
+    assert history.valid(tmp_path).folder.name == "step-000000001000"
     flip_byte(tmp_path / "step-000000001000")
     with pytest.warns(UserWarning, match=r"passed over.*step-000000001000"):
-        assert checkpoint.newest(tmp_path).name == "step-000000000900"
+        assert history.valid(tmp_path).folder.name == "step-000000000900"
+    told: list[str] = []
+    assert history.valid(tmp_path, told.append).state == {"step": 900}
+    assert len(told) == 1 and "policy.safetensors" in told[0]
 
 
 def test_newest_without_a_valid_one(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no checkpoint"):
-        checkpoint.newest(tmp_path / "absent")
+        history.valid(tmp_path / "absent")
     folder = checkpoint.save(checkpoint.step_folder(tmp_path, 1), tensors(), {})
     flip_byte(folder)
-    with pytest.warns(UserWarning, match="passed over"), pytest.raises(CheckpointError, match="damaged"):
-        checkpoint.newest(tmp_path)
+    with (
+        pytest.warns(UserWarning, match="passed over"),
+        pytest.raises(CheckpointError, match="no valid.*policy"),
+    ):
+        history.valid(tmp_path)
 
 
 def test_leftovers_of_a_crash_go_and_nothing_else(tmp_path: Path) -> None:
     kept = checkpoint.save(checkpoint.step_folder(tmp_path, 5), {}, {})
-    leftover = tmp_path / f"{checkpoint.TEMPORARY}step-000000000006-ab"
+    leftover = tmp_path / f"{TEMPORARY}step-000000000006-ab"
     leftover.mkdir()
     (leftover / "state.json").write_text("{")
-    checkpoint.remove_leftovers(tmp_path)
+    remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == [kept]
 
 

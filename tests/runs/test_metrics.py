@@ -40,6 +40,8 @@ KNOWN_TO_USERS = [
     "time/env_seconds",
     "time/act_seconds",
     "time/update_seconds",
+    "time/checkpoint_seconds",
+    "time/checkpoint_megabytes",
 ]
 
 LANGUAGE = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tightrope.runs import checkpoint
+from tightrope.runs.checkpoint import CheckpointError
+from tightrope.runs.durable import TEMPORARY
 from tightrope.runs.records import dumps, plain, read_json, read_lines, write_json
 from tightrope.runs.run import Run
 
@@ -72,21 +74,106 @@ def test_an_undeclared_metric_is_refused_and_not_written(tmp_path: Path) -> None
         assert run.read_metrics() == []
 
 
-def test_rewind_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
-    with Run.create(tmp_path / "a", SETTINGS, "name") as run:
-        for step in (10, 20, 30):
+def saved(path: Path, *steps: int, **more: Any) -> Run:
+    """A run with an update, an episode and a checkpoint at each of these steps."""
+    with Run.create(path, SETTINGS, "name") as run:
+        for step in steps:
             run.record(step, step / 10, {"time/fps": 1.0})
             run.record_episodes([{"step": step - 1, "return": 0.0, "length": 1}])
-        checkpoint.save(run.checkpoint_folder(20), {}, {})
-        (run.checkpoints / f"{checkpoint.TEMPORARY}step").mkdir()
+            run.save(step, {"policy": {"w": torch.ones(3) * step}}, {"at": step}, **{**KEEP, **more})
+    return run
+
+
+def fail(text: str) -> None:
+    raise AssertionError(text)
+
+
+KEEP: dict[str, Any] = {"keep": None, "say": fail}
+
+
+def test_rewind_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
+    """To the byte: rows of the checkpoint's own step that were recorded after it go too."""
+    with saved(tmp_path / "a", 10, 20) as run:
+        wanted = [(run.path / name).read_bytes() for name in ("metrics.jsonl", "episodes.jsonl")]
+        run.record_episodes([{"step": 20, "return": 1.0}])
+        run.record(30, 3.0, {"time/fps": 1.0})
+        run.record_samples([{"step": 30}])
+        (run.checkpoints / f"{TEMPORARY}step").mkdir()
+        (run.path / f"{TEMPORARY}settings.json-0").write_text("{")
         with open(run.path / "metrics.jsonl", "a") as file:
             file.write('{"step": 40, "sec')  # a crash in the middle of a line
-        run.rewind(20)
+        point = run.resume_point(fail)
+        assert (point.folder, point.state["at"]) == (run.checkpoint_folder(20), 20)
+        run.rewind(point)
+        assert [(run.path / n).read_bytes() for n in ("metrics.jsonl", "episodes.jsonl")] == wanted
+        assert (run.path / "samples.jsonl").read_bytes() == b""
         run.record(25, 2.5, {})
         assert [row["step"] for row in run.read_metrics()] == [10, 20, 25]
         assert [row["step"] for row in run.read_episodes()] == [9, 19]
-        assert run.newest_checkpoint() == run.checkpoint_folder(20)
-        assert [p.name for p in run.checkpoints.iterdir()] == ["step-000000000020"]
+        left = {p.name for parent in (run.path, run.checkpoints) for p in parent.iterdir()}
+        assert not [name for name in left if name.startswith(".")]
+
+
+def test_without_a_checkpoint_a_run_begins_anew(tmp_path: Path) -> None:
+    with Run.create(tmp_path / "a", SETTINGS, "name") as run:
+        run.record(10, 1.0, {})
+        run.rewind(None)
+        assert run.read_metrics() == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: text[: len(text) // 2], "the checkpoint counts on"),
+        (lambda text: text.replace("1.0", "9.0"), "another file"),
+        (lambda text: text[1:] + "x", "another file"),
+    ],
+)
+def test_records_that_are_not_the_checkpoints_lead_to_an_older_one_or_a_clear_error(
+    tmp_path: Path, change: Any, said: str
+) -> None:
+    with saved(tmp_path / "a", 10, 20) as run:
+        path, told = run.path / "metrics.jsonl", list[str]()
+        first, second = path.read_text().splitlines(keepends=True)
+        path.write_text(first + change(second))
+        point = run.resume_point(told.append)
+        assert point.state["at"] == 10
+        assert said in told[0] and "metrics.jsonl" in told[0] and "step-000000000020" in told[0]
+        path.write_text(change(first))
+        with pytest.raises(CheckpointError, match=r"no valid checkpoint.*metrics\.jsonl"):
+            run.resume_point(told.append)
+        path.unlink()
+        with pytest.raises(CheckpointError, match=r"metrics\.jsonl has 0 bytes"):
+            run.resume_point(told.append)
+
+
+def test_a_checkpoint_that_was_passed_over_is_put_aside(tmp_path: Path) -> None:
+    """Nobody takes it for the newest later, and the step can be saved again."""
+    with saved(tmp_path / "a", 10, 20) as run:
+        (run.checkpoint_folder(20) / "state.json").write_text("{}")
+        told: list[str] = []
+        point = run.resume_point(told.append)
+        assert [text[:8] for text in told] == ["warning:"] and "state.json" in told[0]
+        run.rewind(point)
+        assert (run.checkpoints / "unusable-step-000000000020" / "state.json").read_text() == "{}"
+        run.save(20, {}, {"at": "again"}, **KEEP)
+        assert run.newest().state["at"] == "again"
+
+
+def test_what_a_checkpoint_took_is_a_metric_of_the_next_update(tmp_path: Path) -> None:
+    with saved(tmp_path / "a", 10, 20) as run:
+        first, second = run.read_metrics()
+        assert not [name for name in first if "checkpoint" in name]
+        size = sum(p.stat().st_size for p in run.checkpoint_folder(10).iterdir())
+        assert second["time/checkpoint_megabytes"] == size / 1e6
+        assert 0 < second["time/checkpoint_seconds"] < 60
+
+
+def test_settings_and_records_lie_in_the_checkpoint(tmp_path: Path) -> None:
+    with saved(tmp_path / "a", 10) as run:
+        state = run.newest().state
+        assert state["settings"] == run.settings
+        assert set(state["records"]) == {"metrics.jsonl", "episodes.jsonl"}
 
 
 def test_the_summary_ends_a_run(tmp_path: Path) -> None:

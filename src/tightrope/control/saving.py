@@ -12,10 +12,16 @@ from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
 from tightrope.control.agent import AGENTS, Agent, anywhere
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import checkpoint
+from tightrope.runs.durable import present
 
 
-def save_agent(agent: Agent, folder: Path, *, extra: dict[str, Any] | None = None) -> Path:
-    """Write the agent into ``folder`` as safetensors and JSON; ``extra`` goes into its state."""
+def save_agent(agent: Agent, folder: Path) -> Path:
+    """Write the agent into ``folder`` as safetensors and JSON. Raises CannotWrite."""
+    return checkpoint.save(folder, *snapshot(agent))
+
+
+def snapshot(agent: Agent) -> tuple[dict[str, dict[str, torch.Tensor]], dict[str, Any]]:
+    """Everything that `restore` needs, as tensors and JSON; the tensors are the agent's own."""
     tensors = {"policy": dict(agent.policy.state_dict()), "optimiser": optimiser_tensors(agent.optimiser)}
     normalisers = agent.normalisers.state()
     if normalisers:
@@ -30,9 +36,8 @@ def save_agent(agent: Agent, folder: Path, *, extra: dict[str, Any] | None = Non
             "sampling": agent.sampling_rng.bit_generator.state,
             "update": agent.update_rng.bit_generator.state,
         },
-        **(extra or {}),
     }
-    return checkpoint.save(folder, tensors, state)
+    return tensors, state
 
 
 def load(
@@ -50,8 +55,7 @@ def load(
     needed when the saved policy was a module of your own.  ``engine``: who computes further updates (auto,
     fused, torch); with another ``device`` it is chosen anew.
     """
-    folder = agent_folder(Path(path), best=best)
-    tensors, state = checkpoint.load(folder)
+    tensors, state = read(Path(path), best=best)
     settings = settings_from_json(state["settings"])
     if device is not None and device != settings.device:
         settings = settings.with_values(device=device, engine="auto")
@@ -90,20 +94,21 @@ def rebuild(env: Any, path: str | Path, *, settings: TrainSettings, **more: Any)
         ) from error
 
 
-def agent_folder(path: Path, *, best: bool = False) -> Path:
-    """The checkpoint folder inside a run, or the path itself when it is one. Raises ValueError when there is
-    none.
+def read(path: Path, *, best: bool = False) -> tuple[dict[str, dict[str, torch.Tensor]], dict[str, Any]]:
+    """Tensors and state of a run, also while it is written, or of a folder that ``save`` wrote. Raises
+    ValueError when there are none.
     """
-    if (path / "manifest.json").is_file():
-        return path
+    if (present(path) / "manifest.json").is_file():
+        return checkpoint.load(path)
     from tightrope.runs.run import Run
 
     run = Run.open(path)
     if not best:
-        return run.newest_checkpoint()
-    if not run.best.is_dir():
+        point = run.newest()
+        return point.tensors, point.state
+    if not present(run.best).is_dir():
         raise ValueError(f"{path} has no best policy: no evaluation took place. Leave --best out.")
-    return run.best
+    return checkpoint.load(run.best)
 
 
 def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: dict[str, Any]) -> None:

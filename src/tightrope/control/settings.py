@@ -103,6 +103,9 @@ class TrainSettings:
     checkpoint_every: float | None = setting(
         0.05, "Fraction of the run between checkpoints; none: only the last.", above=0, at_most=1
     )
+    keep_checkpoints: int | None = setting(
+        3, "Checkpoints that are kept, the newest ones; the best policy always is. none: all.", at_least=2
+    )
     tensorboard: bool = setting(False, "Also write TensorBoard event files into the run folder.")
 
     def __post_init__(self) -> None:

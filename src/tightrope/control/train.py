@@ -13,10 +13,10 @@ from typing import Any
 from tightrope.control.agent import AGENTS, Agent, Progress
 from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
-from tightrope.control.saving import rebuild, restore, save_agent
+from tightrope.control.saving import rebuild, restore, save_agent, snapshot
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
-from tightrope.runs import checkpoint
-from tightrope.runs.run import Run
+from tightrope.runs.durable import CannotWrite
+from tightrope.runs.run import Run, teller
 
 __all__ = ["resolve", "resume", "train"]
 
@@ -46,8 +46,8 @@ def train(
     agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=_notice(report))
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
-    run = Run.create(run_dir, settings_to_json(settings), name, tensorboard=settings.tensorboard)
-    return _continue(agent, run, settings.total_steps, report, best=float("-inf"), wall=0.0)
+    with Run.create(run_dir, settings_to_json(settings), name, tensorboard=settings.tensorboard) as run:
+        return _continue(agent, run, settings.total_steps, report, best=float("-inf"), wall=0.0)
 
 
 def resume(
@@ -62,8 +62,13 @@ def resume(
 
     ``total_steps`` extends a finished run. Episodes that were running at the checkpoint begin anew.
     """
-    run = Run.open(run_dir)
-    tensors, state = checkpoint.load(run.newest_checkpoint())
+    with Run.open(run_dir).lock() as run:
+        return _resume(run, total_steps, report, env, policy)
+
+
+def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, policy: Any) -> dict[str, Any]:
+    run_dir, point = run.path, run.resume_point(teller(report))
+    state = point.state
     settings = settings_from_json(state["settings"])
     if env is None and (state["own_environment"] or ":" in settings.env):
         raise ValueError(
@@ -75,8 +80,8 @@ def resume(
         settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
     agent = rebuild(source, run_dir, policy=policy, settings=settings, notify=_notice(report))
-    restore(agent, tensors, state)
-    run.rewind(agent.steps)
+    restore(agent, point.tensors, state)
+    run.rewind(point)
     run.update_settings(settings_to_json(agent.settings))
     if agent.steps + settings.num_envs > settings.total_steps:
         report(
@@ -110,18 +115,17 @@ def _continue(
             run.record(step, wall, metrics)
             report("update", {"step": step, "total_steps": total_steps, "metrics": metrics, "seconds": wall})
             if save_at.due(step):
-                _save(agent, run, evaluator.best, wall)
+                _save(agent, run, evaluator.best, wall, report)
             clock = time.perf_counter()
         final = evaluator.evaluate()
-        _save(agent, run, evaluator.best, wall)
+        _save(agent, run, evaluator.best, wall, report, final=True)
     except KeyboardInterrupt:
         if not interrupt.torn:
-            _save(agent, run, evaluator.best, wall)
+            _save(agent, run, evaluator.best, wall, report, final=True)
         raise
     finally:
         evaluator.close()
         agent.close()
-        run.close()
     summary = _summary(agent, run, wall, (agent.steps - begin) / max(wall - wall_before, 1e-9))
     summary |= {"final": final, "best_mean_reward": evaluator.best if math.isfinite(evaluator.best) else None}
     run.finish(summary)
@@ -206,9 +210,18 @@ class _Evaluator:
         }
         self.report("evaluation", {"step": self.agent.steps, **metrics})
         if result["mean_return"] > self.best:
-            self.best = result["mean_return"]
-            save_agent(self.agent, self.run.best)
+            self._keep(result["mean_return"])
         return metrics
+
+    def _keep(self, mean: float) -> None:
+        """Save the policy as the best; where the disk refuses, the best one is still the one before."""
+        try:
+            save_agent(self.agent, self.run.best)
+        except CannotWrite as error:
+            text = f"warning: The best policy is not saved: {error.what} {error.advice}. Training goes on."
+            self.report("line", {"text": text})
+        else:
+            self.best = mean
 
     def close(self) -> None:
         if self.environments is not None:
@@ -230,5 +243,8 @@ class _Grid:
         return reached
 
 
-def _save(agent: Agent, run: Run, best: float, wall: float) -> None:
-    save_agent(agent, run.checkpoint_folder(agent.steps), extra={"best": best, "wall_seconds": wall})
+def _save(agent: Agent, run: Run, best: float, wall: float, report: Reporter, *, final: bool = False) -> None:
+    tensors, state = snapshot(agent)
+    state |= {"best": best, "wall_seconds": wall}
+    keep, say = agent.settings.keep_checkpoints, teller(report)
+    run.save(agent.steps, tensors, state, keep=keep, say=say, final=final)

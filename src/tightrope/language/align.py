@@ -17,7 +17,7 @@ from tightrope.language.kl import bias_of
 from tightrope.language.saving import restore_state
 from tightrope.language.settings import NOT_HERE, AlignSettings
 from tightrope.language.trainer import Aligned, Trainer
-from tightrope.runs.run import Run
+from tightrope.runs.run import Run, teller
 
 __all__ = ["Aligned", "align", "resume_align"]
 
@@ -111,11 +111,13 @@ def resume_align(
         settings.reward if reward is None else reward,
         settings.gold if gold is None else gold,
     )
-    trainer = Trainer(settings, *sources, report)
-    restore_state(trainer, run.newest_checkpoint())
-    run.rewind(trainer.episodes)
-    run.update_settings(dataclasses.asdict(settings))
-    return trainer.run(run)
+    with run.lock():
+        trainer = Trainer(settings, *sources, report)
+        point = run.resume_point(teller(report))
+        restore_state(trainer, point)
+        run.rewind(point)
+        run.update_settings(dataclasses.asdict(settings))
+        return trainer.run(run)
 
 
 def settings_from_json(data: dict[str, Any]) -> AlignSettings:

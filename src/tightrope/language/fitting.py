@@ -36,7 +36,7 @@ from tightrope.language.models import (
 )
 from tightrope.language.saving import Progress, load_progress, put_back, save_progress, tensors_of
 from tightrope.language.settings import SupervisedSettings
-from tightrope.runs.run import Run
+from tightrope.runs.run import Run, teller
 
 Item = TypeVar("Item")
 Reporter = Callable[[str, dict[str, Any]], None]
@@ -221,10 +221,10 @@ def fit(
     brake, items = Brake(parameters[0].device), objective.items
     each = math.ceil(len(items) / settings.minibatch_size)
     total = each * settings.num_epochs
-    now, saved = load_progress(run, Progress(objective.name, len(items)))
+    now, saved = load_progress(run, Progress(objective.name, len(items)), teller(report))
     if saved is not None:
-        put_back(saved, parameters, optimiser)
-    run.rewind(now.step or -1)  # what stands at step 0 is recorded again
+        put_back(saved.tensors, parameters, optimiser)
+    run.rewind(saved)  # without a checkpoint what stands at step 0 is recorded again
     run.update_settings(dataclasses.asdict(settings))
     facts = {"run_dir": str(run.path), "step": now.step, "total_steps": total}
     report("start", {"settings": run.settings, "lines": list(lines), **facts})
@@ -250,7 +250,8 @@ def fit(
         event = {"step": now.step, "metrics": metrics, "seconds": now.seconds}
         report("update", {**event, "total_steps": total})
         if now.step == total or reaches(now.step, total, settings.checkpoint_every):
-            save_progress(run, now, tensors_of(parameters, optimiser))
+            keep, say, final = settings.keep_checkpoints, teller(report), now.step == total
+            save_progress(run, now, tensors_of(parameters, optimiser), keep=keep, say=say, final=final)
     return now.newest
 
 

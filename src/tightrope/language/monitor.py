@@ -182,6 +182,11 @@ class Monitor:
         """``objective/gold_predicted_peak_kl``, where the points decide it."""
         return {"objective/gold_predicted_peak_kl": self.fit.peak_kl} if self.fit.decided else {}
 
+    @property
+    def newest_gold(self) -> float | None:
+        """The gold score of the newest evaluation that gave one."""
+        return self._points[-1][2] if self._points else None
+
     def state(self) -> dict[str, Any]:
         """What `restore` needs, as JSON can hold it."""
         points = [[kl, proxy if math.isfinite(proxy) else None, gold] for kl, proxy, gold in self._points]

@@ -219,7 +219,7 @@ def resume_reward(
     """Go on with a run of `train_reward`, as `resume_sft` does with one of `train_sft`."""
     given = {"data": data, "validation": validation, "demonstrations": demonstrations}
     run, settings = reopened(RewardSettings, run_dir, **given, model=model and model[0])
-    with prepared(settings, "reward", model, report) as loaded:
+    with run, prepared(settings, "reward", model, report) as loaded:
         return _train(settings, loaded, given, report, run)
 
 

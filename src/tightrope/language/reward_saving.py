@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from tightrope.language import lora
 from tightrope.language.fitting import Loaded
-from tightrope.runs.checkpoint import writing
+from tightrope.runs.durable import whole
 
 SHIFT = "tightrope_reward_shift"  # in config.json: score = what the head says - shift
 
@@ -50,12 +50,13 @@ def save_reward(
     state = {name: tensor.cpu() for name, tensor in {**state, "score.weight": head}.items()}
     skeleton.load_state_dict(state, strict=True, assign=True)
     setattr(skeleton.config, SHIFT, shift)
-    with writing(path / "model"):
-        skeleton.save_pretrained(path / "model")
-        loaded.tokenizer.save_pretrained(path / "model")
-    (path / "model" / "README.md").write_text(card(shift, loaded.source, final), encoding="utf-8")
+    with whole(path / "model") as folder:
+        skeleton.save_pretrained(folder)
+        loaded.tokenizer.save_pretrained(folder)
+        (folder / "README.md").write_text(card(shift, loaded.source, final), encoding="utf-8")
     if loaded.adapter is not None:
-        _save_adapter(path / "adapter", head, shift, loaded)
+        with whole(path / "adapter") as folder:
+            _save_adapter(folder, head, shift, loaded)
 
 
 def _save_adapter(folder: Path, head: Tensor, shift: float, loaded: Loaded) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +19,9 @@ from tightrope.language import lora
 from tightrope.language.models import find_model
 from tightrope.language.roles import Roles
 from tightrope.language.settings import AlignSettings
-from tightrope.runs import checkpoint
-from tightrope.runs.run import Run
+from tightrope.runs.durable import whole
+from tightrope.runs.history import Checkpoint, steps_in
+from tightrope.runs.run import Run, teller
 
 if TYPE_CHECKING:
     from tightrope.language.trainer import Trainer
@@ -33,15 +34,18 @@ def save_model(roles: Roles, path: Path, settings: AlignSettings) -> None:
     name = "policy" if settings.tune == "lora" else None
     write_model(roles.model, roles.tokenizer, path / "model", name)
     if name is not None:
-        lora.save_adapter(roles.model, name, path / "adapter", base_model=find_model(settings.model))
+        with whole(path / "adapter") as folder:
+            lora.save_adapter(roles.model, name, folder, base_model=find_model(settings.model))
 
 
 def write_model(model: Any, tokenizer: Any, folder: Path, adapter: str | None) -> None:
-    """Any transformers model with one adapter folded in, and its tokenizer, as safetensors."""
+    """Any transformers model with one adapter folded in, and its tokenizer, as safetensors; whole or absent.
+    Raises CannotWrite.
+    """
     state = {key: tensor.cpu() for key, tensor in lora.merged_state(model, adapter).items()}
-    with checkpoint.writing(folder):
-        model.save_pretrained(folder, state_dict=state)
-        tokenizer.save_pretrained(folder)
+    with whole(folder) as temporary:
+        model.save_pretrained(temporary, state_dict=state)
+        tokenizer.save_pretrained(temporary)
 
 
 Tensors = dict[str, dict[str, Tensor]]
@@ -61,8 +65,8 @@ def put_back(tensors: Tensors, parameters: Sequence[nn.Parameter], optimiser: to
     restore_optimiser(optimiser, tensors["optimiser"])
 
 
-def save_state(trainer: Trainer, run: Run) -> Path:
-    """A checkpoint at the present episode."""
+def save_state(trainer: Trainer, run: Run, *, final: bool = False) -> None:
+    """A checkpoint at the present episode; see `Run.save`. The best one has the highest gold score."""
     tensors = tensors_of(trainer.roles.parameters(), trainer.optimiser)
     state: dict[str, Any] = {
         "story": "align",
@@ -77,12 +81,14 @@ def save_state(trainer: Trainer, run: Run) -> Path:
     }
     if trainer.pretraining is not None:
         state["rng"]["ptx"] = trainer.pretraining.rng.bit_generator.state
-    return checkpoint.save(run.checkpoint_folder(trainer.episodes), tensors, state)
+    keep, say = trainer.settings.keep_checkpoints, teller(trainer.report)
+    gold = trainer.monitor.newest_gold
+    run.save(trainer.episodes, tensors, state, keep=keep, say=say, merit=gold, final=final)
 
 
-def restore_state(trainer: Trainer, folder: Path) -> None:
+def restore_state(trainer: Trainer, point: Checkpoint) -> None:
     """Put a checkpoint into a trainer of the same settings. ValueError when it is another story's."""
-    tensors, state = checkpoint.load(folder)
+    folder, tensors, state = point
     if state.get("story") != "align":
         raise ValueError(f"{folder} is no checkpoint of an alignment run.")
     put_back(tensors, trainer.roles.parameters(), trainer.optimiser)
@@ -110,27 +116,33 @@ class Progress:
     newest: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
-def save_progress(run: Run, progress: Progress, tensors: Tensors) -> Path:
-    """A checkpoint of supervised training at its present step."""
-    return checkpoint.save(run.checkpoint_folder(progress.step), tensors, dataclasses.asdict(progress))
+def save_progress(run: Run, progress: Progress, tensors: Tensors, **how: Any) -> None:
+    """A checkpoint of supervised training at its present step; see `Run.save`. The best one is that of the
+    best newest figure on held-out examples.
+    """
+    loss, accuracy = (progress.newest.get(name) for name in ("sft/held_out_loss", "reward/held_out_accuracy"))
+    merit = accuracy if loss is None else -loss
+    run.save(progress.step, tensors, dataclasses.asdict(progress), merit=merit, **how)
 
 
-def load_progress(run: Run, fresh: Progress) -> tuple[Progress, Tensors | None]:
+def load_progress(
+    run: Run, fresh: Progress, say: Callable[[str], None]
+) -> tuple[Progress, Checkpoint | None]:
     """The newest checkpoint of a run; ``fresh`` and None where the run has saved nothing yet.
 
     ValueError when it is another story's, or stands in other data than ``fresh`` does.
     """
-    if not any(run.checkpoints.glob("step-*")):
+    if not steps_in(run.checkpoints):
         return fresh, None
-    folder = run.newest_checkpoint()
-    tensors, state = checkpoint.load(folder)
+    point = run.resume_point(say)
+    folder, _, state = point
     if state.get("story") != fresh.story:
         raise ValueError(f"{folder} is a checkpoint of {state.get('story')!r}, expected {fresh.story!r}.")
-    found = Progress(**state)
+    found = Progress(**{field.name: state[field.name] for field in dataclasses.fields(Progress)})
     if found.items != fresh.items:
         raise ValueError(
             f"{run.path} was learning from {found.items} examples, the data now have {fresh.items}. Give the "
             "data that the run began with, or begin a new run."
         )
     found.newest = {name: math.nan if x is None else x for name, x in found.newest.items()}
-    return found, tensors
+    return found, point

@@ -39,6 +39,11 @@ class ModelSettings:
     checkpoint_every: float | None = setting(
         0.25, "Fraction of the run between checkpoints; none: only the last.", above=0, at_most=1
     )
+    keep_checkpoints: int | None = setting(
+        3,
+        "Checkpoints that are kept: the newest, and the best by held-out figures. none: all.",
+        at_least=2,
+    )
 
     def __post_init__(self) -> None:
         """Check every field against its range."""

@@ -33,6 +33,7 @@ from tightrope.language.saving import write_model
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised import announcement, finish, opened, recorded, reopened
 from tightrope.language.token_stats import Sampling, token_statistics
+from tightrope.runs.durable import whole
 
 
 def hidden_states(model: Any, rows: Packed) -> Tensor:
@@ -106,7 +107,7 @@ def resume_sft(
     """
     given = {"data": data, "validation": validation, "model": model and model[0]}
     run, settings = reopened(SFTSettings, run_dir, **given)
-    with prepared(settings, "sft", model, report) as loaded:
+    with run, prepared(settings, "sft", model, report) as loaded:
         return _train(settings, loaded, data, validation, report, run)
 
 
@@ -135,7 +136,8 @@ def _train(
         final = fit(objective, parameters, settings, run, report, lines)
         write_model(model, loaded.tokenizer, run.path / "model", loaded.adapter)
         if loaded.adapter is not None:
-            lora.save_adapter(model, loaded.adapter, run.path / "adapter", base_model=loaded.source)
+            with whole(run.path / "adapter") as folder:
+                lora.save_adapter(model, loaded.adapter, folder, base_model=loaded.source)
         return finish(settings, run, report, final, rows=len(rows), held_out_rows=len(held), tokens=learnt)
 
 

@@ -33,9 +33,10 @@ def recorded(settings: Settings, **given: Any) -> Settings:
 
 
 def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[Run, Settings]:
-    """A run to go on with, and its settings with what is given again now.
+    """A run to go on with, locked, and its settings with what is given again now.
 
-    ValueError when it is another command's, or when something that was an object is not given.
+    ValueError when it is another command's, or when something that was an object is not given; RunInUse when
+    it has another writer.
     """
     run = Run.open(run_dir)
     unknown = sorted(set(run.settings) - {field.name for field in dataclasses.fields(kind)})
@@ -48,7 +49,7 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
                 f"The {name} of {run_dir} was {run.settings[name]}, an object that no file holds. Give it "
                 f"again: {name}=... in Python{command}."
             )
-    return run, recorded(kind(**run.settings), **given)
+    return run.lock(), recorded(kind(**run.settings), **given)
 
 
 def opened(run: Run | str | Path | None, settings: SupervisedSettings, command: str) -> Run:

@@ -136,7 +136,7 @@ class Trainer:
                 if saves.due(self.episodes / settings.total_episodes):
                     save_state(self, run)
                     self.report("samples", {"step": self.episodes, "rows": rows})
-            save_state(self, run)
+            save_state(self, run, final=True)
             save_model(self.roles, run.path, settings)
             summary = self._summary(run, metrics)
             run.finish(summary)

@@ -3,33 +3,37 @@ unpickled.
 
 A checkpoint is written under a name that starts with a dot, made durable, and renamed into place, so a crash
 at any moment leaves either no folder or a complete one. Reading trusts nothing: the manifest names every file
-with its size and SHA-256, and a folder that differs from its manifest in any way is refused.
+with its size and SHA-256, and itself has to be the very text that its content gives; a folder that differs
+from its manifest in any way is refused.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
+import io
+import platform
 import re
-import shutil
 import stat
-import uuid
-import warnings
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tightrope.runs.records import read_json, sync_folder, write_json
+from tightrope.runs import tensors as safetensors_file
+from tightrope.runs.durable import present, whole, write_file
+from tightrope.runs.records import canonical, dumps, read_json
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 FORMAT = "tightrope-checkpoint"
-VERSION = 1
-TEMPORARY = ".saving-"
+VERSION = 2
+READS = 5  # of a folder that is replaced while it is read
 _STEM = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _STEP_FOLDER = re.compile(r"step-(\d{12})")
+_LIBRARIES = ("torch", "numpy", "gymnasium", "transformers")
+_ADVICE = "The checkpoint is damaged or was changed: use another one, or train again."
 
 
 class CheckpointError(ValueError):
@@ -47,15 +51,40 @@ def step_of(folder: Path) -> int:
     return int(match.group(1)) if match else -1
 
 
+def versions() -> dict[str, str]:
+    """Those of Python, of this library, and of the libraries that are loaded."""
+    from importlib import metadata
+
+    try:
+        own = metadata.version("tightrope")
+    except metadata.PackageNotFoundError:
+        own = "not installed"
+    loaded = {name: str(sys.modules[name].__version__) for name in _LIBRARIES if name in sys.modules}
+    return {"python": platform.python_version(), "tightrope": own, **loaded}
+
+
+def changed_versions(folder: Path) -> str:
+    """The libraries that a checkpoint was written with in another version than is loaded now, in words."""
+    written, now = read_manifest(present(folder)).get("versions"), versions()
+    known = written if isinstance(written, dict) else {}
+    found = [
+        f"{name} {known[name]} (now {now[name]})" for name in now if known.get(name, now[name]) != now[name]
+    ]
+    return ", ".join(found)
+
+
+# ---------------------------------------------------------------------------- writing
+
+
 def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, Any]) -> Path:
     """Write a checkpoint and return its folder; an existing one there is replaced once the new one is
     complete.
 
-    ``tensors`` maps a file stem to its named tensors (``{"policy": {...}}`` becomes policy.safetensors);
-    tensors are copied to contiguous CPU memory, dtypes kept. ``state`` is JSON; integers of any size are
-    exact, a float that is not finite becomes null, so what must come back to the bit belongs into
-    ``tensors``. Whatever goes wrong, no visible folder is left. Raises CheckpointError for a stem that is not
-    a plain name, OSError as the system does.
+    ``tensors`` maps a file stem to its named tensors (``{"policy": {...}}`` becomes policy.safetensors),
+    dtypes kept. ``state`` is JSON; integers of any size are exact, a float that is not finite becomes null,
+    so what must come back to the bit belongs into ``tensors``. Whatever goes wrong, no visible folder is
+    left. Raises CheckpointError for a stem that is not a plain name, CannotWrite, which is an OSError, for
+    what the disk refuses.
     """
     folder = Path(folder)
     _refuse_to_replace(folder)
@@ -64,48 +93,33 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
             raise CheckpointError(
                 f"{stem!r} is no file stem for a checkpoint. Use letters, digits, '-' and '_'."
             )
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f"{TEMPORARY}{folder.name}-{uuid.uuid4().hex[:8]}")
-    temporary.mkdir()
-    try:
-        with writing(folder):
-            _fill(temporary, tensors, state)
-        _put(temporary, folder)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+    with whole(folder, sync=False) as temporary:
+        parts: dict[str, Any] = {"state.json": [(dumps(state, indent=2) + "\n").encode("utf-8")]}
+        parts |= {f"{stem}.safetensors": safetensors_file.content(group) for stem, group in tensors.items()}
+        files = {}
+        for name, content in parts.items():
+            size, digest = write_file(temporary / name, content)
+            files[name] = {"size": size, "sha256": digest}
+        manifest = {
+            "format": FORMAT,
+            "version": VERSION,
+            "step": step_of(folder) if step_of(folder) >= 0 else None,
+            "files": files,
+            "versions": versions(),
+            "settings_sha256": _hash(state["settings"]) if "settings" in state else None,
+        }
+        write_file(temporary / "manifest.json", [_manifest_text(manifest)])
     return folder
 
 
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Inside, what safetensors cannot write, on a full disk for one, is an OSError that names ``path``."""
-    from safetensors import SafetensorError
-
-    try:
-        yield
-    except SafetensorError as error:
-        raise OSError(
-            f"{path} cannot be written ({error}). Make room on the disk and try again; a run that has a "
-            "checkpoint goes on with: tightrope resume RUN"
-        ) from error
+def _manifest_text(manifest: dict[str, Any]) -> bytes:
+    """The one text of a manifest, the hash of its content in it."""
+    bare = {name: value for name, value in manifest.items() if name != "sha256"}
+    return (dumps({**bare, "sha256": _hash(bare)}, indent=2) + "\n").encode("utf-8")
 
 
-def _fill(temporary: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, Any]) -> None:
-    from safetensors.torch import save_file
-
-    write_json(temporary / "state.json", state)
-    for stem, group in tensors.items():
-        # A copy each: parameters may be views of one buffer, which safetensors refuses to write.
-        copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in group.items()}
-        save_file(copies, temporary / f"{stem}.safetensors")
-    files = {}
-    for path in sorted(temporary.iterdir()):
-        with open(path, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-            os.fsync(file.fileno())
-        files[path.name] = {"size": path.stat().st_size, "sha256": digest}
-    write_json(temporary / "manifest.json", {"format": FORMAT, "version": VERSION, "files": files})
+def _hash(value: Any) -> str:
+    return hashlib.sha256(canonical(value)).hexdigest()
 
 
 def _refuse_to_replace(folder: Path) -> None:
@@ -113,7 +127,7 @@ def _refuse_to_replace(folder: Path) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     try:
-        _declared(folder)
+        read_manifest(folder)
     except (CheckpointError, OSError) as error:
         raise CheckpointError(
             f"{folder} is there already and is no checkpoint of this library, so it is not replaced "
@@ -121,32 +135,7 @@ def _refuse_to_replace(folder: Path) -> None:
         ) from error
 
 
-def _put(temporary: Path, folder: Path) -> None:
-    """Rename into place. A folder cannot be renamed over a full one, so an old one steps aside first; see
-    `load`.
-    """
-    aside = _aside(folder)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
-    if folder.exists():
-        if aside.exists():
-            shutil.rmtree(aside)
-        os.rename(folder, aside)
-    os.rename(temporary, folder)
-    sync_folder(folder.parent)
-    if aside.exists():
-        shutil.rmtree(aside)
-
-
-def _aside(folder: Path) -> Path:
-    return folder.with_name(f".replaced-{folder.name}")
-
-
-def remove_leftovers(parent: Path) -> None:
-    """Delete the temporaries of a save that a crash cut off. Only for the one process that writes there."""
-    for path in parent.glob(f"{TEMPORARY}*") if parent.is_dir() else ():
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
+# ---------------------------------------------------------------------------- reading
 
 
 def load(folder: Path) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
@@ -154,14 +143,17 @@ def load(folder: Path) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
     fault.
 
     A crash between the two renames of a replacement leaves the old checkpoint set aside; it is found and
-    used.
+    used. One that is replaced while it is read is read again.
     """
+    return _steadily(Path(folder), _load)
+
+
+def _load(folder: Path) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
     from safetensors import SafetensorError
     from safetensors.torch import load as parse
 
-    folder = _present(Path(folder))
     tensors: dict[str, dict[str, Tensor]] = {}
-    for name, entry in _declared(folder).items():
+    for name, entry in read_manifest(folder)["files"].items():
         if name == "state.json":
             continue
         # Hashed and parsed are the same bytes: a file changed in between cannot slip in.
@@ -172,14 +164,17 @@ def load(folder: Path) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
             raise CheckpointError(
                 f"{folder / name} is not a safetensors file ({error}). {_ADVICE}"
             ) from error
-    return tensors, load_state(folder)
+    return tensors, _load_state(folder)
 
 
 def load_state(folder: Path) -> dict[str, Any]:
     """The verified ``state.json`` of a checkpoint alone: cheap, and without importing torch."""
-    folder = _present(Path(folder))
+    return _steadily(Path(folder), _load_state)
+
+
+def _load_state(folder: Path) -> dict[str, Any]:
     path = folder / "state.json"
-    _verified(path, _declared(folder)["state.json"])
+    _verified(path, read_manifest(folder)["files"]["state.json"])
     try:
         state = read_json(path)
     except ValueError as error:
@@ -191,47 +186,44 @@ def load_state(folder: Path) -> dict[str, Any]:
 
 def verify(folder: Path) -> None:
     """Raise CheckpointError unless the folder holds exactly what its manifest declares."""
-    folder = _present(Path(folder))
-    for name, entry in _declared(folder).items():
-        _verified(folder / name, entry)
+
+    def check(folder: Path) -> None:
+        for name, entry in read_manifest(folder)["files"].items():
+            _verified(folder / name, entry, read=False)
+
+    _steadily(Path(folder), check)
 
 
-def newest(checkpoints: Path) -> Path:
-    """The newest valid checkpoint in a folder of them.
-
-    A damaged one is passed over with a warning that names it; CheckpointError when none is left.
-    """
-    checkpoints = Path(checkpoints)
-    found = [p for p in checkpoints.iterdir() if step_of(p) >= 0] if checkpoints.is_dir() else []
-    for folder in sorted(found, key=step_of, reverse=True):
+def _steadily(folder: Path, read: Callable[[Path], Any]) -> Any:
+    """What ``read`` gives of a folder, tried again as long as another folder has taken its place."""
+    for left in reversed(range(READS)):
+        before = _identity(folder)
         try:
-            verify(folder)
-        except CheckpointError as error:
-            warnings.warn(f"Checkpoint passed over: {error}", stacklevel=2)
-        else:
-            return folder
-    if found:
-        raise CheckpointError(
-            f"{checkpoints} holds no valid checkpoint, all {len(found)} are damaged. Train again."
-        )
-    raise CheckpointError(
-        f"{checkpoints} holds no checkpoint: the run stopped before its first. Train again."
-    )
+            if before is None:
+                raise CheckpointError(f"{folder} is not a checkpoint folder: no such folder. Check the path.")
+            return read(present(folder))
+        except (CheckpointError, FileNotFoundError) as error:
+            if not left or _identity(folder) == before:
+                if isinstance(error, CheckpointError):
+                    raise
+                raise CheckpointError(f"{folder} was deleted while it was read.") from error
+    raise AssertionError("unreachable")
 
 
-_ADVICE = "The checkpoint is damaged or was changed: use another one, or train again."
+def _identity(folder: Path) -> tuple[Path, int, int] | None:
+    place = present(folder)
+    try:
+        found = place.stat()
+    except FileNotFoundError:
+        return None
+    return (place, found.st_dev, found.st_ino) if stat.S_ISDIR(found.st_mode) else None
 
 
-def _present(folder: Path) -> Path:
-    if not folder.exists() and _aside(folder).is_dir():
-        return _aside(folder)
-    if not folder.is_dir():
-        raise CheckpointError(f"{folder} is not a checkpoint folder: no such folder. Check the path.")
-    return folder
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest, after checking it against itself, and that the folder holds its files and nothing else.
 
-
-def _declared(folder: Path) -> dict[str, dict[str, Any]]:
-    """The manifest's files, after checking that the folder holds them and nothing else."""
+    Keys: format, version, step, files (size and sha256 by name), versions (of libraries), settings_sha256.
+    """
     path = folder / "manifest.json"
     _regular(path)
     try:
@@ -245,19 +237,31 @@ def _declared(folder: Path) -> dict[str, dict[str, Any]]:
             f"{path} has version {manifest.get('version')!r}, this tightrope reads {VERSION}. "
             "Use the tightrope that wrote it, or upgrade this one."
         )
-    files = manifest.get("files")
+    try:
+        expected = _manifest_text(manifest)
+    except RecursionError:
+        expected = b""
+    if path.read_bytes() != expected:
+        raise CheckpointError(f"{path} does not match its own SHA-256. {_ADVICE}")
+    if step_of(folder) >= 0 and manifest.get("step") not in (None, step_of(folder)):
+        raise CheckpointError(f"{path} is of step {manifest['step']}, its folder of another. {_ADVICE}")
+    _check_names(folder, manifest.get("files"))
+    return manifest
+
+
+def _check_names(folder: Path, files: Any) -> None:
+    path = folder / "manifest.json"
     if not isinstance(files, dict) or "state.json" not in files:
         raise CheckpointError(f"{path} does not declare state.json. {_ADVICE}")
     for name in files:
         stem = name.removesuffix(".safetensors")
         if name != "state.json" and (stem == name or not _STEM.fullmatch(stem)):
             raise CheckpointError(f"{path} declares {name!r}, which is no plain NAME.safetensors. {_ADVICE}")
-    present = {p.name for p in folder.iterdir()} - {"manifest.json"}
-    for name in sorted(present - set(files)):
+    inside = {p.name for p in folder.iterdir()} - {"manifest.json"}
+    for name in sorted(inside - set(files)):
         raise CheckpointError(f"{folder / name} is not declared in manifest.json. {_ADVICE}")
-    for name in sorted(set(files) - present):
+    for name in sorted(set(files) - inside):
         raise CheckpointError(f"{folder / name} is missing, manifest.json declares it. {_ADVICE}")
-    return files
 
 
 def _regular(path: Path) -> None:
@@ -270,8 +274,10 @@ def _regular(path: Path) -> None:
         raise CheckpointError(f"{path} is not a regular file. {_ADVICE}")
 
 
-def _verified(path: Path, entry: Any) -> bytes:
-    """The bytes of a file whose size and SHA-256 are the declared ones."""
+def _verified(path: Path, entry: Any, *, read: bool = True) -> bytes:
+    """The bytes of a file whose size and SHA-256 are the declared ones; unless ``read``, none, and no memory
+    for them.
+    """
     _regular(path)
     if not isinstance(entry, dict):
         raise CheckpointError(
@@ -282,7 +288,9 @@ def _verified(path: Path, entry: Any) -> bytes:
         raise CheckpointError(
             f"{path} has {size} bytes, manifest.json declares {entry.get('size')}. {_ADVICE}"
         )
-    content = path.read_bytes()
-    if hashlib.sha256(content).hexdigest() != entry.get("sha256"):
+    content = path.read_bytes() if read else b""
+    with contextlib.nullcontext(io.BytesIO(content)) if read else open(path, "rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest != entry.get("sha256"):
         raise CheckpointError(f"{path} does not match the SHA-256 in manifest.json. {_ADVICE}")
     return content

@@ -34,6 +34,13 @@ _TABLE = (
         "time/update_seconds", "s", "down", "Seconds of this update that advantages and gradient steps took."
     ),
     metric(
+        "time/checkpoint_seconds",
+        "s",
+        "down",
+        "Seconds that training waited for the checkpoint before this update: written and read back.",
+    ),
+    metric("time/checkpoint_megabytes", "MB", "down", "Size of that checkpoint."),
+    metric(
         "train/approx_kl",
         "nats",
         "inside",
@@ -163,7 +170,7 @@ def of_story(story: Literal["control", "language"]) -> list[Metric]:
     if story == "control":
         return shared
     clock = ("time/fps", "time/seconds", "time/update_seconds")
-    both = [m for m in shared if m.name.startswith("train/") or m.name in clock]
+    both = [m for m in shared if m.name.startswith(("train/", "time/checkpoint_")) or m.name in clock]
     return [*both, *LANGUAGE_TABLE]
 
 

@@ -1,12 +1,20 @@
-"""JSON that every reader accepts: plain types, no NaN literal, files that are whole or absent."""
+"""JSON that every reader accepts: plain types, no NaN literal, files that are whole or absent, and files that
+grow line by line.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import math
 import os
 from pathlib import Path
 from typing import Any
+
+from tightrope.runs.durable import BLOCK, replace_file, write_all, writing
+
+RECORDS = ("metrics.jsonl", "episodes.jsonl", "samples.jsonl")  # of a run: the files that grow
 
 
 def plain(value: Any) -> Any:
@@ -39,19 +47,17 @@ def dumps(value: Any, indent: int | None = None) -> str:
     return json.dumps(plain(value), allow_nan=False, indent=indent, ensure_ascii=False)
 
 
+def canonical(value: Any) -> bytes:
+    """The one JSON text of a value, to be hashed: sorted names, no spaces."""
+    return json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
 def write_json(path: Path, value: Any) -> None:
-    """Write one JSON file so that a reader sees the old one or the new one whole, also after a crash."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with open(temporary, "w", encoding="utf-8") as file:
-            file.write(dumps(value, indent=2) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
+    """Write one JSON file so that a reader sees the old one or the new one whole, also after a crash. Raises
+    CannotWrite.
+    """
+    with writing(path):
+        replace_file(path, (dumps(value, indent=2) + "\n").encode("utf-8"))
 
 
 def read_json(path: Path) -> Any:
@@ -71,9 +77,16 @@ def read_json(path: Path) -> Any:
 def read_lines(path: Path) -> list[dict[str, Any]]:
     """The objects of a .jsonl file, an empty list where there is no file.
 
-    A last line that was torn by a crash is left out; a torn line in the middle raises ValueError with its
-    number.
+    A last line that was torn by a crash, or is being written, is left out; a torn line in the middle raises
+    ValueError with its number.
     """
+    try:
+        return _parsed(path)
+    except ValueError:  # a run that went on may have cut the file back while it was read
+        return _parsed(path)
+
+
+def _parsed(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
@@ -93,13 +106,79 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable, where the platform knows how (fsync of a directory)."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:  # Windows cannot open a folder
-        return
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+class Recorder:
+    """A .jsonl file that grows by whole lines, and knows its length and SHA-256 at any moment.
+
+    Opening it cuts off a last line that is torn. Raises CannotWrite.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._descriptor = -1
+        with writing(path):
+            flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+            self._descriptor = os.open(path, flags, 0o666)
+            content = path.read_bytes()
+        self._size = content.rfind(b"\n") + 1
+        self._digest = hashlib.sha256(content[: self._size])
+        self._cut()
+
+    def append(self, text: str) -> None:
+        """Add lines. What cannot be written leaves the file as it was."""
+        content = text.encode("utf-8")
+        with writing(self.path):
+            try:
+                write_all(self._descriptor, content)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    self._cut()
+                raise
+        self._size += len(content)
+        self._digest.update(content)
+
+    def _cut(self) -> None:
+        with writing(self.path):
+            os.ftruncate(self._descriptor, self._size)
+            os.lseek(self._descriptor, 0, os.SEEK_END)
+
+    def sync(self) -> dict[str, Any]:
+        """Make it durable; returns the mark of this moment, for `agrees` and `cut_back`."""
+        with writing(self.path):
+            os.fsync(self._descriptor)
+        return {"bytes": self._size, "sha256": self._digest.hexdigest()}
+
+    def close(self) -> None:
+        """Give the file back."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def __del__(self) -> None:
+        self.close()
+
+
+def disagreement(path: Path, mark: dict[str, Any]) -> str:
+    """Why a file does not begin with what a mark of `Recorder.sync` counted; empty where it does."""
+    size = path.stat().st_size if path.exists() else 0
+    if size < mark["bytes"]:
+        return f"{path} has {size} bytes, the checkpoint counts on {mark['bytes']}"
+    digest, left = hashlib.sha256(), mark["bytes"]
+    with open(path, "rb") if left else contextlib.nullcontext() as file:
+        while left and file is not None:
+            block = file.read(min(left, BLOCK))
+            digest.update(block)
+            left -= len(block)
+    if digest.hexdigest() != mark["sha256"]:
+        return f"{path} is another file than the checkpoint counts on, or was changed"
+    return ""
+
+
+def cut_back(path: Path, size: int) -> None:
+    """Shorten a file to its first ``size`` bytes, durably. Raises CannotWrite."""
+    with writing(path):
+        descriptor = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+        try:
+            os.ftruncate(descriptor, size)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -2,32 +2,55 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-import os
 import re
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import TYPE_CHECKING, Any
 
-from tightrope.runs import checkpoint, metrics
-from tightrope.runs.records import dumps, plain, read_json, read_lines, write_json
+from tightrope.runs import checkpoint, durable, history, metrics
+from tightrope.runs.checkpoint import CheckpointError
+from tightrope.runs.durable import CannotWrite, sync_folder, writing
+from tightrope.runs.folders import fresh, require_free, why_not
+from tightrope.runs.history import Checkpoint, marks_of
+from tightrope.runs.lock import WriterLock
+from tightrope.runs.records import (
+    RECORDS,
+    Recorder,
+    cut_back,
+    disagreement,
+    dumps,
+    plain,
+    read_json,
+    read_lines,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def teller(report: Callable[[str, dict[str, Any]], None]) -> Callable[[str], None]:
+    """What tells the user a text through the ``line`` event of a report; a warning when it begins so."""
+    return lambda text: report("line", {"text": text, "warning": text.startswith("warning:")})
 
 
 class Run:
     """The files of one run. Made by `create` or `open`; nothing is written before something is recorded.
 
-    ``settings`` is the resolved content of settings.json. Of a run there is one writer; readers may come at
-    any time.
+    ``settings`` is the resolved content of settings.json. Of a run there is one writer: what writes takes the
+    lock first (see `lock`). Readers may come at any time.
     """
 
     def __init__(self, path: Path, settings: dict[str, Any], tensorboard: Any = None) -> None:
         self.path = path
         self.settings = settings
         self._tensorboard = tensorboard
-        self._files: dict[str, IO[str]] = {}
+        self._files: dict[str, Recorder] = {}
+        self._lock: WriterLock | None = None
+        self._costs: dict[str, float] = {}
 
     @classmethod
     def create(
@@ -40,25 +63,38 @@ class Run:
         anything is written.
         """
         writer_class = _summary_writer() if tensorboard else None
-        if run_dir is None:
-            path = _fresh(Path("runs"), re.sub(r"[^\w.-]+", "-", name))
-        else:
-            path = Path(run_dir)
-            _make(path)
-        settings = plain(settings)
-        write_json(path / "settings.json", settings)
-        return cls(path, settings, writer_class(str(path / "tensorboard")) if writer_class else None)
+        with writing(Path("runs") if run_dir is None else Path(run_dir)):
+            if run_dir is None:
+                path = fresh(Path("runs"), re.sub(r"[^\w.-]+", "-", name))
+            else:
+                path = Path(run_dir)
+                require_free(path)
+                durable.make_folders(path)
+        run = cls(path, plain(settings)).lock()
+        require_free(path)  # nobody has taken it before the lock was ours
+        write_json(path / "settings.json", run.settings)
+        run._tensorboard = writer_class(str(path / "tensorboard")) if writer_class else None
+        return run
 
     @classmethod
     def open(cls, path: str | Path, *, tensorboard: bool = False) -> Run:
         """An existing run folder. Raises ValueError where there is none, naming a near one."""
         path = Path(path)
         if not (path / "settings.json").is_file():
-            raise ValueError(f"{path} is not a run folder: {_why_not(path)}")
+            raise ValueError(f"{path} is not a run folder: {why_not(path)}")
         settings = read_json(path / "settings.json")
         if not isinstance(settings, dict):
             raise ValueError(f"{path / 'settings.json'} holds {type(settings).__name__}, expected an object.")
         return cls(path, settings, _summary_writer()(str(path / "tensorboard")) if tensorboard else None)
+
+    def lock(self) -> Run:
+        """Become the one writer, until `close` or the end of the process; nothing when it is already.
+
+        Raises RunInUse naming who writes now.
+        """
+        if self._lock is None:
+            self._lock = WriterLock(self.path)
+        return self
 
     @property
     def checkpoints(self) -> Path:
@@ -79,14 +115,17 @@ class Run:
         """Where the checkpoint of this step belongs: ``checkpoints/step-000000060000``."""
         return checkpoint.step_folder(self.checkpoints, step)
 
-    def newest_checkpoint(self) -> Path:
-        """The newest valid checkpoint, damaged ones passed over with a warning. Raises CheckpointError."""
-        return checkpoint.newest(self.checkpoints)
+    def newest(self) -> Checkpoint:
+        """The newest valid checkpoint, read; for anybody at any time. Damaged ones are passed over with a
+        warning. Raises CheckpointError.
+        """
+        return history.valid(self.checkpoints)
 
     def record(self, step: int, seconds: float, values: dict[str, float]) -> None:
-        """Append the metrics of one update: every name must be declared, floats that are not finite become
-        null.
+        """Append the metrics of one update, and what the checkpoint before it took: every name must be
+        declared, floats that are not finite become null. Raises CannotWrite, as all that writes here.
         """
+        values, self._costs = {**values, **self._costs}, {}
         metrics.check_names(values)
         self._append("metrics.jsonl", [{"step": step, "seconds": seconds, **values}])
         if self._tensorboard is None:
@@ -106,13 +145,14 @@ class Run:
 
     def _append(self, name: str, rows: Iterable[dict[str, Any]]) -> None:
         text = "".join(dumps(row) + "\n" for row in rows)
-        if not text:
-            return
+        if text:
+            self._recorder(name).append(text)
+
+    def _recorder(self, name: str) -> Recorder:
+        self.lock()
         if name not in self._files:
-            file = open(self.path / name, "a", encoding="utf-8")  # noqa: SIM115 - closed in close()
-            self._files[name] = file
-        self._files[name].write(text)
-        self._files[name].flush()
+            self._files[name] = Recorder(self.path / name)
+        return self._files[name]
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The rows of metrics.jsonl so far; a line torn by a crash is left out."""
@@ -122,41 +162,123 @@ class Run:
         """The rows of episodes.jsonl so far; a line torn by a crash is left out."""
         return read_lines(self.path / "episodes.jsonl")
 
-    def rewind(self, step: int) -> None:
-        """Before going on from the checkpoint of ``step``: forget what was recorded after it, and half-
-        written saves.
+    def save(
+        self,
+        step: int,
+        tensors: dict[str, dict[str, Tensor]],
+        state: dict[str, Any],
+        *,
+        keep: int | None,
+        say: Callable[[str], None],
+        merit: float | None = None,
+        final: bool = False,
+    ) -> None:
+        """A checkpoint at ``step``; when it has been read back, all but the newest ``keep`` go, and the one
+        of the highest ``merit`` stays.
+
+        What was recorded is on the disk before the checkpoint can be seen, which keeps its length. What the
+        disk refuses is said and training goes on, unless this is the ``final`` one, or asked for by somebody:
+        then CannotWrite is raised. ``settings``, ``records`` and ``merit`` are added to ``state``.
+        """
+        self.lock()
+        folder, clock = self.checkpoint_folder(step), time.perf_counter()
+        try:
+            with writing(folder):
+                self._clean()
+                added = {"records": self._sync(), "merit": merit}
+                checkpoint.save(folder, tensors, {"settings": self.settings, **state, **added})
+                self._read_back(folder)
+        except CannotWrite as error:
+            if final:
+                raise
+            say(f"warning: No checkpoint at step {step:,}: {error.what} {error.advice}. Training goes on.")
+            return
+        try:
+            history.prune(self.checkpoints, keep)
+        except OSError as error:
+            say(f"warning: An old checkpoint cannot be deleted: {error}. See to {self.checkpoints}.")
+        size = sum(path.stat().st_size for path in folder.iterdir())
+        seconds = time.perf_counter() - clock
+        self._costs = {"time/checkpoint_seconds": seconds, "time/checkpoint_megabytes": size / 1e6}
+
+    def _sync(self) -> dict[str, Any]:
+        """Make everything recorded durable; returns the marks of the files."""
+        there = [name for name in RECORDS if name in self._files or (self.path / name).exists()]
+        marks = {name: self._recorder(name).sync() for name in there}
+        sync_folder(self.path)
+        return marks
+
+    def _read_back(self, folder: Path) -> None:
+        try:
+            checkpoint.verify(folder)
+        except CheckpointError as error:
+            durable.remove(folder)
+            raise CannotWrite(folder, error) from error
+
+    def _clean(self) -> None:
+        for parent in (self.path, self.checkpoints):
+            durable.remove_leftovers(parent)
+
+    def resume_point(self, say: Callable[[str], None]) -> Checkpoint:
+        """Where the run can go on: the newest checkpoint that is valid and counts on no more than the record
+        files hold. ``say`` is told what was passed over, who left the run without an end, and what has
+        changed since. Raises CheckpointError where there is none.
+        """
+        self.lock()
+        assert self._lock is not None
+        if self._lock.left_by:
+            say(f"the run was left without an end by {self._lock.left_by}")
+        point = history.valid(self.checkpoints, lambda text: say(f"warning: {text}"), self._check_records)
+        if changed := checkpoint.changed_versions(point.folder):
+            say(f"warning: {point.folder} was written with {changed}: the same bits are not promised.")
+        return point
+
+    def _check_records(self, point: Checkpoint) -> None:
+        for name, mark in marks_of(point).items():
+            if wrong := disagreement(self.path / name, mark):
+                raise CheckpointError(
+                    f"{wrong}. Put the file back as it was. {point.folder} itself is whole: tightrope.load "
+                    "and evaluate read it."
+                )
+
+    def rewind(self, point: Checkpoint | None) -> None:
+        """Before going on from ``point``, or from the beginning: forget what was recorded after it, and half-
+        written saves. Newer checkpoints, which cannot be used, get a name that begins with ``unusable-``.
 
         Without this a resumed run would list the updates between checkpoint and crash twice.
         """
+        self.lock()
         self._close_files()
-        for name in ("metrics.jsonl", "episodes.jsonl", "samples.jsonl"):
-            path = self.path / name
-            if not path.exists():
-                continue
-            kept = [row for row in read_lines(path) if row.get("step", 0) <= step]
-            temporary = path.with_name(f".{name}")
-            with open(temporary, "w", encoding="utf-8") as file:
-                file.writelines(dumps(row) + "\n" for row in kept)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        (self.path / "summary.json").unlink(missing_ok=True)
-        for parent in (self.path, self.checkpoints):
-            checkpoint.remove_leftovers(parent)
+        with writing(self.path):
+            self._clean()
+            for folder in history.steps_in(self.checkpoints):
+                if checkpoint.step_of(folder) > (-1 if point is None else checkpoint.step_of(point.folder)):
+                    durable.put(folder, folder.with_name(f"unusable-{folder.name}"))
+            marks = {} if point is None else marks_of(point)
+            for name in RECORDS:
+                if (self.path / name).exists():
+                    cut_back(self.path / name, marks.get(name, {"bytes": 0})["bytes"])
+            (self.path / "summary.json").unlink(missing_ok=True)
+            sync_folder(self.path)
 
     def update_settings(self, settings: dict[str, Any]) -> None:
         """Replace settings.json: a resumed run may go on under another budget."""
+        self.lock()
         self.settings = plain(settings)
         write_json(self.path / "settings.json", self.settings)
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Write summary.json, the sign of a run that came to its end, and close the files."""
+        self.lock()
         write_json(self.path / "summary.json", summary)
         self.close()
 
     def close(self) -> None:
-        """Close what is open; recording again opens it again."""
+        """Close what is open and let others write; recording again opens it again."""
         self._close_files()
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
         if self._tensorboard is not None:
             self._tensorboard.close()
 
@@ -172,45 +294,6 @@ class Run:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _make(path: Path) -> None:
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise ValueError(
-            f"run_dir {path} exists and is not empty; a run is never overwritten. "
-            f"Give another --run-dir, delete the folder, or go on with: tightrope resume {path}"
-        )
-    path.mkdir(parents=True, exist_ok=True)
-
-
-def _fresh(parent: Path, name: str) -> Path:
-    """A new folder named after the present second; a number is added when it is taken."""
-    stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    for number in range(1, 1000):
-        path = parent / (stem if number == 1 else f"{stem}-{number}")
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        return path
-    raise ValueError(f"{parent} already holds a thousand runs named {stem}. Give --run-dir.")
-
-
-def _why_not(path: Path) -> str:
-    reason = "it holds no settings.json." if path.is_dir() else "there is no such folder."
-    inside = _runs_in(path)
-    if inside:
-        return f"{reason} Its newest run is {inside[-1]}."
-    near = difflib.get_close_matches(path.name, [p.name for p in _runs_in(path.parent)], n=1, cutoff=0.6)
-    if near:
-        return f"{reason} Did you mean {path.parent / near[0]}?"
-    return f"{reason} Give a folder that tightrope train wrote."
-
-
-def _runs_in(folder: Path) -> list[Path]:
-    """The run folders directly in a folder, the newest last."""
-    found = [p for p in folder.iterdir() if (p / "settings.json").is_file()] if folder.is_dir() else []
-    return sorted(found, key=lambda p: (p / "settings.json").stat().st_mtime)
 
 
 def _summary_writer() -> Any:

@@ -1,0 +1,50 @@
+"""Run folders by name: a fresh one, and the one that was meant."""
+
+from __future__ import annotations
+
+import difflib
+import time
+from pathlib import Path
+
+from tightrope.runs.lock import NAME
+
+
+def require_free(path: Path) -> None:
+    """ValueError unless a run may be made here: nothing is there, or nothing but a lock."""
+    inside = path.iterdir() if path.is_dir() else ()
+    if (path.exists() and not path.is_dir()) or any(entry.name != NAME for entry in inside):
+        raise ValueError(
+            f"run_dir {path} exists and is not empty; a run is never overwritten. "
+            f"Give another --run-dir, delete the folder, or go on with: tightrope resume {path}"
+        )
+
+
+def fresh(parent: Path, name: str) -> Path:
+    """A new folder named after the present second; a number is added when it is taken."""
+    stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for number in range(1, 1000):
+        path = parent / (stem if number == 1 else f"{stem}-{number}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return path
+    raise ValueError(f"{parent} already holds a thousand runs named {stem}. Give --run-dir.")
+
+
+def why_not(path: Path) -> str:
+    """Why a path is no run folder, and which near one is."""
+    reason = "it holds no settings.json." if path.is_dir() else "there is no such folder."
+    inside = _runs_in(path)
+    if inside:
+        return f"{reason} Its newest run is {inside[-1]}."
+    near = difflib.get_close_matches(path.name, [p.name for p in _runs_in(path.parent)], n=1, cutoff=0.6)
+    if near:
+        return f"{reason} Did you mean {path.parent / near[0]}?"
+    return f"{reason} Give a folder that tightrope train wrote."
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    """The run folders directly in a folder, the newest last."""
+    found = [p for p in folder.iterdir() if (p / "settings.json").is_file()] if folder.is_dir() else []
+    return sorted(found, key=lambda p: (p / "settings.json").stat().st_mtime)

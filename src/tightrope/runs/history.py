@@ -1,0 +1,109 @@
+"""The checkpoints of a run: the newest valid one, and which are kept."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from tightrope.runs.checkpoint import CheckpointError, load, load_state, step_of
+from tightrope.runs.durable import ASIDE, present, remove
+from tightrope.runs.records import RECORDS
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+LOOKS = 5  # at the list of checkpoints, when their writer deletes them meanwhile
+
+
+class Checkpoint(NamedTuple):
+    """What was read: where it lay, its tensors (on the CPU) and its state."""
+
+    folder: Path
+    tensors: dict[str, dict[str, Tensor]]
+    state: dict[str, Any]
+
+
+def steps_in(checkpoints: Path) -> list[Path]:
+    """The checkpoint folders of a run, the oldest first; valid or not. One that stepped aside counts."""
+    inside = checkpoints.iterdir() if checkpoints.is_dir() else ()
+    found = {path.with_name(path.name.removeprefix(ASIDE)) for path in inside}
+    return sorted((path for path in found if step_of(path) >= 0), key=step_of)
+
+
+def valid(
+    checkpoints: Path, notify: Callable[[str], None] | None = None, accept: Callable[..., None] | None = None
+) -> Checkpoint:
+    """The newest valid checkpoint in a folder of them, read.
+
+    A damaged one is passed over, and ``notify`` (None: a warning) told which and why; so is one for which
+    ``accept`` raises CheckpointError. One that its writer deletes meanwhile is no longer looked for.
+    CheckpointError when none is left.
+    """
+    checkpoints, tell, why = Path(checkpoints), notify or _warn, ""
+    for _ in range(LOOKS):
+        found, vanished = steps_in(checkpoints), False
+        for folder in reversed(found):
+            try:
+                read = Checkpoint(folder, *load(folder))
+                if accept is not None:
+                    accept(read)
+                return read
+            except CheckpointError as error:
+                vanished = not present(folder).exists()
+                if vanished:  # there is a newer one now
+                    break
+                why = str(error)
+                tell(f"Checkpoint passed over: {why}")
+        if not vanished:
+            break
+    if found:
+        raise CheckpointError(
+            f"{checkpoints} holds no valid checkpoint, none of {len(found)} can be used. The oldest: {why}"
+        )
+    raise CheckpointError(
+        f"{checkpoints} holds no checkpoint: the run stopped before its first. Train again."
+    )
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, stacklevel=3)
+
+
+def marks_of(point: Checkpoint) -> dict[str, dict[str, Any]]:
+    """What a checkpoint counts on in the record files, by name. CheckpointError where it does not say."""
+    marks = point.state.get("records")
+    known = isinstance(marks, dict) and all(
+        isinstance(mark, dict) and isinstance(mark.get("bytes"), int) for mark in marks.values()
+    )
+    if not known:
+        raise CheckpointError(f"{point.folder / 'state.json'} does not say what had been recorded.")
+    return {name: marks[name] for name in RECORDS if name in marks}
+
+
+def prune(checkpoints: Path, keep: int | None) -> list[Path]:
+    """Delete all but the newest ``keep`` checkpoints (None: delete none) and the best of the others, the one
+    whose state has the highest ``merit``; returns what went.
+
+    To be called when the newest one has been verified, so that a valid one is left whatever happened to the
+    others.
+    """
+    older = [] if keep is None else steps_in(checkpoints)[: -max(keep, 1)]
+    if not older:
+        return []
+    merits = {folder: _merit(folder) for folder in steps_in(checkpoints)}
+    best = max(merits, key=lambda folder: (merits[folder], -step_of(folder)))
+    gone = [folder for folder in older if folder != best or merits[folder] == -math.inf]
+    for folder in gone:
+        remove(folder)
+    return gone
+
+
+def _merit(folder: Path) -> float:
+    try:
+        merit = load_state(folder).get("merit")
+    except (CheckpointError, OSError):
+        return -math.inf
+    return float(merit) if isinstance(merit, int | float) else -math.inf
