@@ -26,7 +26,13 @@ GROUPS = {
     "rollout": ("num_envs", "num_steps", "normalise_observations", "normalise_rewards"),
     "networks": ("hidden", "activation", "shared", "std", "log_std_init", "gsde_steps", "squash"),
     "update rule": (),
-    "evaluation and saving": ("evaluate_every", "evaluation_episodes", "checkpoint_every", "tensorboard"),
+    "evaluation and saving": (
+        "evaluate_every",
+        "evaluation_episodes",
+        "checkpoint_every",
+        "keep_checkpoints",
+        "tensorboard",
+    ),
     "machine": ("vector_backend", "num_workers", "engine", "device", "threads", "compile"),
 }
 
