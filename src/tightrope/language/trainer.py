@@ -134,7 +134,8 @@ class Trainer:
                 event = {"step": self.episodes, "metrics": metrics, "seconds": metrics["time/seconds"]}
                 self.report("update", {**event, **total})
                 if saves.due(self.episodes / settings.total_episodes):
-                    save_state(self, run)
+                    if self.episodes < settings.total_episodes:  # the end has a save of its own
+                        save_state(self, run)
                     self.report("samples", {"step": self.episodes, "rows": rows})
             save_state(self, run, final=True)
             save_model(self.roles, run.path, settings)
