@@ -297,7 +297,8 @@ def test_a_failed_replacement_keeps_the_old_one(tmp_path: Path, monkeypatch: pyt
     folder = checkpoint.save(tmp_path / "best", {}, {"step": 1})
     with monkeypatch.context() as patch:
         patch.setattr(
-            "tightrope.runs.checkpoint.write_file", lambda *_: (_ for _ in ()).throw(OSError("disk full"))
+            "tightrope.runs.checkpoint.write_file",
+            lambda *_, **__: (_ for _ in ()).throw(OSError("disk full")),
         )
         with pytest.raises(OSError, match="disk full"):
             checkpoint.save(folder, {}, {"step": 2})

@@ -89,10 +89,10 @@ def test_failures_at_random_never_cost_the_best_or_the_last(
     """A thousand operations, one in nine of them refused: what was saved can be loaded, the best included."""
     draw, write, merits, saved = random.Random(3), checkpoint.write_file, dict[int, float](), list[int]()
 
-    def sometimes(*args: Any) -> Any:
+    def sometimes(*args: Any, **more: Any) -> Any:
         if draw.random() < 1 / 9:
             raise OSError(28, "No space left")
-        return write(*args)
+        return write(*args, **more)
 
     monkeypatch.setattr("tightrope.runs.checkpoint.write_file", sometimes)
     for step in range(1, 60):

@@ -13,6 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tightrope.runs import checkpoint
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY
 from tightrope.runs.records import dumps, plain, read_json, read_lines, write_json
@@ -158,6 +159,18 @@ def test_a_checkpoint_that_was_passed_over_is_put_aside(tmp_path: Path) -> None:
         assert (run.checkpoints / "unusable-step-000000000020" / "state.json").read_text() == "{}"
         run.save(20, {}, {"at": "again"}, **KEEP)
         assert run.newest().state["at"] == "again"
+
+
+def test_a_damaged_best_is_put_aside_and_can_be_saved_again(tmp_path: Path) -> None:
+    with saved(tmp_path / "a", 10) as run:
+        checkpoint.save(run.best, {}, {"at": 10})
+        run.resume_point(fail)
+        (run.best / "manifest.json").write_text("{}")
+        told: list[str] = []
+        assert run.resume_point(told.append).state["at"] == 10
+        assert len(told) == 1 and "unusable-best" in told[0] and "manifest.json" in told[0]
+        checkpoint.save(run.best, {}, {"at": 20})
+        assert (run.path / "unusable-best").is_dir()
 
 
 def test_what_a_checkpoint_took_is_a_metric_of_the_next_update(tmp_path: Path) -> None:

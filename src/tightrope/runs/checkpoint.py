@@ -93,12 +93,12 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
             raise CheckpointError(
                 f"{stem!r} is no file stem for a checkpoint. Use letters, digits, '-' and '_'."
             )
-    with whole(folder, sync=False) as temporary:
+    with whole(folder) as temporary:
         parts: dict[str, Any] = {"state.json": [(dumps(state, indent=2) + "\n").encode("utf-8")]}
         parts |= {f"{stem}.safetensors": safetensors_file.content(group) for stem, group in tensors.items()}
         files = {}
         for name, content in parts.items():
-            size, digest = write_file(temporary / name, content)
+            size, digest = write_file(temporary / name, content, sync=False)
             files[name] = {"size": size, "sha256": digest}
         manifest = {
             "format": FORMAT,
@@ -108,7 +108,7 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
             "versions": versions(),
             "settings_sha256": _hash(state["settings"]) if "settings" in state else None,
         }
-        write_file(temporary / "manifest.json", [_manifest_text(manifest)])
+        write_file(temporary / "manifest.json", [_manifest_text(manifest)], sync=False)
     return folder
 
 

@@ -63,8 +63,10 @@ def writing(path: Path) -> Iterator[None]:
         raise CannotWrite(path, error) from error
 
 
-def write_file(path: Path, parts: Iterable[bytes | memoryview]) -> tuple[int, str]:
-    """A new file, on the disk when this returns: its size and SHA-256, computed while it is written."""
+def write_file(path: Path, parts: Iterable[bytes | memoryview], *, sync: bool = True) -> tuple[int, str]:
+    """A new file: its size and SHA-256, computed while it is written. It is on the disk when this returns,
+    unless ``sync`` is False.
+    """
     digest, size = hashlib.sha256(), 0
     descriptor = os.open(path, _NEW, 0o666)
     try:
@@ -74,7 +76,8 @@ def write_file(path: Path, parts: Iterable[bytes | memoryview]) -> tuple[int, st
                 digest.update(block)
                 write_all(descriptor, block)
             size += len(part)
-        os.fsync(descriptor)
+        if sync:
+            os.fsync(descriptor)
     finally:
         os.close(descriptor)
     return size, digest.hexdigest()
@@ -101,10 +104,10 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 @contextlib.contextmanager
-def whole(folder: Path, *, sync: bool = True) -> Iterator[Path]:
+def whole(folder: Path) -> Iterator[Path]:
     """A new folder to fill; on leaving it takes the place of ``folder``, whole and durable.
 
-    ``sync``: files in it that other libraries wrote are made durable too; those of `write_file` are already.
+    Files in it are made durable when all are written: the first fsync then carries most of the others.
     Whatever goes wrong, ``folder`` is as it was. Raises CannotWrite.
     """
     temporary = folder.with_name(f"{TEMPORARY}{folder.name}-{uuid.uuid4().hex[:8]}")
@@ -113,7 +116,7 @@ def whole(folder: Path, *, sync: bool = True) -> Iterator[Path]:
             make_folders(folder.parent)
             temporary.mkdir()
             yield temporary
-            (sync_tree if sync else sync_folder)(temporary)
+            sync_tree(temporary)
             put(temporary, folder)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -121,7 +124,7 @@ def whole(folder: Path, *, sync: bool = True) -> Iterator[Path]:
 
 
 def sync_tree(folder: Path) -> None:
-    """Make the names in a folder durable, and what other libraries wrote into it."""
+    """Make a folder durable, its files and its names."""
     for path in sorted(folder.iterdir()):
         if path.is_dir():
             sync_tree(path)

@@ -75,10 +75,9 @@ def _warn(text: str) -> None:
 def marks_of(point: Checkpoint) -> dict[str, dict[str, Any]]:
     """What a checkpoint counts on in the record files, by name. CheckpointError where it does not say."""
     marks = point.state.get("records")
-    known = isinstance(marks, dict) and all(
+    if not isinstance(marks, dict) or not all(
         isinstance(mark, dict) and isinstance(mark.get("bytes"), int) for mark in marks.values()
-    )
-    if not known:
+    ):
         raise CheckpointError(f"{point.folder / 'state.json'} does not say what had been recorded.")
     return {name: marks[name] for name in RECORDS if name in marks}
 

@@ -51,6 +51,7 @@ class Run:
         self._files: dict[str, Recorder] = {}
         self._lock: WriterLock | None = None
         self._costs: dict[str, float] = {}
+        self._new_name = False  # of a record file, not yet durable
 
     @classmethod
     def create(
@@ -151,6 +152,7 @@ class Run:
     def _recorder(self, name: str) -> Recorder:
         self.lock()
         if name not in self._files:
+            self._new_name = self._new_name or not (self.path / name).exists()
             self._files[name] = Recorder(self.path / name)
         return self._files[name]
 
@@ -205,7 +207,9 @@ class Run:
         """Make everything recorded durable; returns the marks of the files."""
         there = [name for name in RECORDS if name in self._files or (self.path / name).exists()]
         marks = {name: self._recorder(name).sync() for name in there}
-        sync_folder(self.path)
+        if self._new_name:
+            sync_folder(self.path)
+            self._new_name = False
         return marks
 
     def _read_back(self, folder: Path) -> None:
@@ -228,10 +232,21 @@ class Run:
         assert self._lock is not None
         if self._lock.left_by:
             say(f"the run was left without an end by {self._lock.left_by}")
+        self._put_aside_a_damaged_best(say)
         point = history.valid(self.checkpoints, lambda text: say(f"warning: {text}"), self._check_records)
         if changed := checkpoint.changed_versions(point.folder):
             say(f"warning: {point.folder} was written with {changed}: the same bits are not promised.")
         return point
+
+    def _put_aside_a_damaged_best(self, say: Callable[[str], None]) -> None:
+        """So that it can be saved again: what is no checkpoint is never replaced."""
+        if not durable.present(self.best).is_dir():
+            return
+        try:
+            checkpoint.verify(self.best)
+        except CheckpointError as error:
+            say(f"warning: The best policy is lost, its folder renamed to unusable-best: {error}")
+            durable.put(durable.present(self.best), self.path / "unusable-best")
 
     def _check_records(self, point: Checkpoint) -> None:
         for name, mark in marks_of(point).items():

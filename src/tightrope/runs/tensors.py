@@ -49,4 +49,4 @@ def content(tensors: dict[str, Tensor]) -> Iterator[bytes | memoryview]:
     yield len(text).to_bytes(8, "little") + text
     for name in ordered:
         plain = tensors[name].detach().cpu().contiguous().reshape(-1)
-        yield memoryview(plain.view(torch.uint8).numpy())
+        yield plain.view(torch.uint8).numpy().data
