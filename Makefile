@@ -4,7 +4,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo demo-language test learn check bench clean
+.PHONY: demo demo-language test learn check bench storm clean
 
 demo: $(VENV)/.core  ## train PPO on CartPole-v1 and say where the run lies
 	$(PY) -m tightrope train CartPole-v1 --seed 1
@@ -25,6 +25,9 @@ check: $(VENV)/.dev  ## format, lint, types, import directions, vocabulary, size
 	$(PY) -m ruff check src tests benchmarks examples demos
 	$(PY) -m mypy
 	$(PY) -m pytest -q tests/contracts
+
+storm: $(VENV)/.dev  ## kill runs again and again, go on, compare to the bit; STORM="--kills 5 --minutes 3"
+	$(PY) benchmarks/storm.py --out benchmarks/results/storm.json $(STORM)
 
 bench: $(VENV)/.dev  ## speed beside the peers that are installed
 	$(PY) benchmarks/speed.py

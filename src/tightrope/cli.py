@@ -164,25 +164,22 @@ def _import_named(name: str | None) -> None:
 
 
 def _watched(run: Callable[[Any], dict[str, Any]], given: Options) -> int:
-    """Train with the right display; print the end; on Ctrl-C the command that goes on."""
+    """Train with the right display; print the end; on SIGINT and SIGTERM the command that goes on."""
     from tightrope import panel
 
     as_json, quiet = bool(given.get("json")), bool(given.get("quiet"))
     stream = sys.stderr if as_json else sys.stdout
     live = not as_json and panel.can_live(sys.stdout, dict(os.environ))
     report = panel.choose(stream, quiet=quiet, live=live)
+    from tightrope.runs import signals
+
     try:
-        with report:
+        with signals.stoppable(), report:
             summary = run(report)
-    except KeyboardInterrupt:
-        if report.run is None:
-            print("Stopped before the run began.", file=sys.stderr)
-        else:
-            resume_command = _command("resume", report.run, given)
-            print(
-                f"Stopped at step {report.step:,} and saved. Go on with:\n  {resume_command}", file=sys.stderr
-            )
-        return 130
+    except KeyboardInterrupt as error:
+        command = _command("resume", report.run or "", given)
+        print(signals.farewell(error, report.run, report.step, "steps", command), file=sys.stderr)
+        return signals.code_of(error)
     if as_json:
         print_json({**summary, "run_dir": report.run})
     else:
@@ -294,7 +291,9 @@ def _show_warning(message: Warning | str, *_args: Any, **_kwargs: Any) -> None:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run a command line and return its exit code: 0, 2 for a user's mistake, 130 after Ctrl-C."""
+    """Run a command line and return its exit code: 0, 2 for a user's mistake, 130 after Ctrl-C, 143 after
+    SIGTERM.
+    """
     words = sys.argv[1:] if words is None else words
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):

@@ -289,6 +289,16 @@ def _require_transformers() -> None:
 # ---------------------------------------------------------------------------- output
 
 
+def _given_again(run: str | None) -> list[str]:
+    """The flags that `resume` of an alignment run asks for again: its judges, where they were code."""
+    from tightrope.runs.run import Run
+
+    settings = {} if run is None else Run.open(run).settings
+    judges = {name: settings.get(name) for name in ("reward", "gold")}
+    code = {name: judge for name, judge in judges.items() if isinstance(judge, str) and ".py:" in judge}
+    return [word for name, judge in code.items() for word in (f"--{name}", judge)]
+
+
 def _watched(run: Callable[[Any], dict[str, Any]], columns: Any, what: str, given: dict[str, Any]) -> int:
     """Run with the right display; print the end."""
     from tightrope import panel
@@ -298,13 +308,15 @@ def _watched(run: Callable[[Any], dict[str, Any]], columns: Any, what: str, give
     stream = sys.stderr if as_json else sys.stdout
     live = not as_json and panel.can_live(sys.stdout, dict(os.environ))
     display = Display(columns, what, stream, quiet=quiet, live=live)
+    from tightrope.runs import signals
+
     try:
-        with display:
+        with signals.stoppable(), display:
             summary = run(display)
-    except KeyboardInterrupt:
-        go_on = f" Go on with:\n  {shlex.join([PROGRAM, 'resume', display.run])}" if display.run else ""
-        print(f"Stopped at {display.step:,} {what}.{go_on}", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as error:
+        command = shlex.join([PROGRAM, "resume", display.run or "", *_given_again(display.run)])
+        print(signals.farewell(error, display.run, display.step, what, command), file=sys.stderr)
+        return signals.code_of(error)
     if as_json:
         print_json({**summary, "run_dir": display.run})
         return 0

@@ -12,12 +12,13 @@ from language.tiny import saved, tiny_llama, tokenizer
 
 from tightrope.cli import main
 from tightrope.language import fitting
-from tightrope.language.fitting import minibatches, reaches
+from tightrope.language.fitting import minibatches
 from tightrope.language.ledger import DoesNotFit, amount, job_of, ledger
 from tightrope.language.reward_model import resume_reward, train_reward
 from tightrope.language.settings import RewardSettings, SFTSettings
 from tightrope.language.sft import resume_sft, train_sft
 from tightrope.runs.checkpoint import step_of
+from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run
 
 FACTS = [f"{a} is {b}." for a, b in zip("abcdefgh", "ponmlkji", strict=True)]
@@ -90,9 +91,9 @@ def test_a_run_that_goes_on_ends_where_one_without_a_break_does(tmp_path, folder
 
 
 def test_saves_lie_on_a_grid_of_the_run_and_at_its_end(tmp_path, folder):
-    assert [step for step in range(1, 13) if reaches(step, 12, 0.25)] == [3, 6, 9, 12]
-    assert [step for step in range(1, 4) if reaches(step, 3, 0.1)] == [1, 2, 3]
-    assert not any(reaches(step, 12, None) for step in range(1, 13))
+    assert [step for step in range(1, 13) if crosses(step - 1, step, 12, 0.25)] == [3, 6, 9, 12]
+    assert [step for step in range(1, 4) if crosses(step - 1, step, 3, 0.1)] == [1, 2, 3]
+    assert not any(crosses(step - 1, step, 12, None) for step in range(1, 13))
     for every, wanted in ((0.5, [6, 12]), (None, [12])):
         run = tmp_path / str(every)
         settings = SFTSettings(model=folder, held_out=0.0, checkpoint_every=every, **FAST)
@@ -196,7 +197,7 @@ def test_ctrl_c_says_what_to_type(tmp_path, folder, capsys, monkeypatch):
         patch.setattr(fitting, "take_step", interrupted)
         words = ["--model", folder, "--data", str(data), "--max-tokens", "32", "--threads", "1"]
         assert main(["sft", *words, "--run-dir", run]) == 130
-    assert f"Stopped at 0 steps. Go on with:\n  tightrope resume {run}\n" in capsys.readouterr().err
+    assert f"all 0 steps will be repeated. Go on with:\n  tightrope resume {run}\n" in capsys.readouterr().err
     assert main(["resume", run]) == 0
 
 

@@ -14,7 +14,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from tightrope.runs import checkpoint, history
+from tightrope.runs import checkpoint, history, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY, CannotWrite, remove_leftovers, writing
 from tightrope.runs.tensors import content
@@ -236,7 +236,7 @@ def test_the_manifest_says_what_it_was_written_with(folder: Path) -> None:
         content = (folder / name).read_bytes()
         assert entry == {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     assert manifest["versions"]["torch"] == torch.__version__
-    assert set(manifest["versions"]) >= {"python", "tightrope", "torch"}
+    assert set(manifest["versions"]) >= {"python", "tightrope", "processor", "torch"}
     own = {name: value for name, value in manifest.items() if name != "sha256"}
     text = json.dumps(own, sort_keys=True, separators=(",", ":")).encode()
     assert manifest["sha256"] == hashlib.sha256(text).hexdigest()
@@ -253,19 +253,23 @@ def test_the_settings_have_a_hash_of_their_own(tmp_path: Path) -> None:
 
 def test_a_manifest_imports_no_library(tmp_path: Path) -> None:
     code = (
-        "import sys\nfrom pathlib import Path\nfrom tightrope.runs import checkpoint\n"
+        "import sys\nfrom pathlib import Path\nfrom tightrope.runs import checkpoint, versions\n"
         f"checkpoint.save(Path({str(tmp_path / 'c')!r}), {{}}, {{}})\n"
         "assert not {'torch', 'gymnasium', 'transformers'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-    assert set(checkpoint.read_manifest(tmp_path / "c")["versions"]) <= {"python", "tightrope", "numpy"}
+    assert set(checkpoint.read_manifest(tmp_path / "c")["versions"]) <= {
+        "python",
+        "tightrope",
+        "processor",
+        "numpy",
+    }
 
 
 def test_other_versions_are_told(folder: Path) -> None:
-    assert checkpoint.changed_versions(folder) == ""
-    versions = {**checkpoint.versions(), "torch": "1.0"}
-    rewrite_manifest(versions=versions)(folder)
-    assert checkpoint.changed_versions(folder) == f"torch 1.0 (now {torch.__version__})"
+    written = checkpoint.read_manifest(folder)["versions"]
+    assert versions.differences(written) == ""
+    assert versions.differences({**written, "torch": "1.0"}) == f"torch 1.0 -> {torch.__version__}"
 
 
 DTYPES = [

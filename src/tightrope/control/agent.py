@@ -27,6 +27,7 @@ from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import ObservationLayout
 from tightrope.control.threads import limited_threads
 from tightrope.maths.values import explained_variance
+from tightrope.runs.grid import crosses
 
 Array = np.ndarray
 CRUMB = 16  # columns; ten epochs on fewer steps than this would only add noise to a finished policy
@@ -34,12 +35,17 @@ CRUMB = 16  # columns; ten epochs on fewer steps than this would only add noise 
 
 @dataclass(frozen=True)
 class Progress:
-    """One update of a run: agent steps so far, the budget, every metric, and the episodes that ended."""
+    """One update of a run: agent steps so far, the budget, every metric, and the episodes that ended.
+
+    ``on_grid``: the update reached a point of the checkpoint grid; environments that cannot give their state
+    begin anew behind it, whether or not anything is saved.
+    """
 
     step: int
     total_steps: int
     metrics: dict[str, float]
     episodes: list[tuple[float, int, bool]]
+    on_grid: bool = False
 
 
 class Agent:
@@ -84,7 +90,7 @@ class Agent:
         self.sampling_rng, self.update_rng, self.predict_rng = (np.random.default_rng(x) for x in seeds)
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
         self.steps, self.kl_beta = 0, getattr(present.update, "kl_beta", None)
-        self._fresh, self.notify = True, notify
+        self.fresh, self.notify = True, notify  # fresh: episodes begin anew with the next rollout
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
 
     # ---------------------------------------------------------------------------------------------- learning
@@ -104,16 +110,18 @@ class Agent:
         """
         budget = self.settings.total_steps if total_steps is None else total_steps
         start = self.steps if start is None else start
-        if self._fresh:
-            self.collector.reset(self.settings.seed + self.steps)
-            self._fresh = False
-        first = True
+        first, every = True, self.settings.checkpoint_every
         while (columns := self._next_columns(budget, start)) > 0:
+            if self.fresh:
+                self.collector.reset(self.settings.seed, self.steps)
+            before = self.steps - start
             # beside the engine's own two threads BLAS threads only spin: its products are too small to share
             with limited_threads(1 if self.engine.name == "fused" else self.settings.threads or 1):
                 metrics, episodes = self._one_update(columns, (self.steps - start) / budget, check=first)
-            first = False
-            yield Progress(self.steps - start, budget, metrics, episodes)
+            first, after = False, self.steps - start
+            on_grid = crosses(before, after, budget, every)
+            self.fresh = on_grid and not self.environments.gives_state
+            yield Progress(after, budget, metrics, episodes, on_grid)
 
     def _next_columns(self, budget: int, start: int) -> int:
         """Columns of the next rollout, never more than the budget allows; a crumb at its end is left
@@ -217,8 +225,7 @@ class Agent:
         """Noise [rows, A] for Policy.act."""
         return torch.from_numpy(self.collector.noise(1, rows, rng)[0]).to(self.policy.device)
 
-    # ---------------------------------------------------------------------------------------- moving and
-    # saving
+    # ------------------------------------------------------------------------------------- moving and saving
 
     def set_env(self, env: Any) -> Agent:
         """Go on learning on another environment with the same spaces (a warm start).
@@ -236,9 +243,7 @@ class Agent:
                     f"The new environment has {name[:-7]}s {seen}; this policy was made for {expected}."
                 )
         old.close()
-        self.env, self.environments, self._fresh = env, fresh, True
-        if self.normalisers.rewards is not None:
-            self.normalisers.rewards.restart(fresh.num_envs)
+        self.env, self.environments, self.fresh = env, fresh, True
         self.collector = Collector(fresh, self.normalisers, self.sampling_rng)
         named = dataclasses.replace(free, env=fresh.spec_id)
         self.settings = _resolved(named, fresh, self.engine.name, free.threads)

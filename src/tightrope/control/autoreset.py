@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from tightrope.control import states
 from tightrope.control.nested import MASK_KEY
 from tightrope.control.spaces import (
     ActionLayout,
@@ -80,7 +81,7 @@ class VectorCopies:
         """Reset all rows, seeded; the first inputs and action masks."""
         env = self._make(seed)
         if env is not self._env:
-            self._close_env()
+            self.close()
             self._use(env)
         self._count = 0
         self._ended, self._any_ended = np.zeros(self.num_envs, bool), False
@@ -304,11 +305,17 @@ class VectorCopies:
         where = f"environment {index} of {self.name}" if index >= 0 else f"the vector environment {self.name}"
         return EnvironmentFault(f"{where} at step {self._count} cannot be used: {what}.", index, self._count)
 
+    def get_state(self) -> list[Any]:
+        """The packed state of the environment, and the rows that its next step resets."""
+        return [states.state_of(self._env), self._ended.tolist()]
+
+    def set_state(self, found: list[Any]) -> None:
+        """Go on from what `get_state` gave, after a reset."""
+        states.put_back(self._env, found[0])
+        self._ended, self._any_ended = np.array(found[1], bool), any(found[1])
+
     def close(self) -> None:
         """Close the environment unless it is the caller's own; closing twice is fine."""
-        self._close_env()
-
-    def _close_env(self) -> None:
         if self._env is not None and not self._keep:
             self._env.close()
         self._env = None

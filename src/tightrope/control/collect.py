@@ -13,10 +13,18 @@ import torch
 
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
+from tightrope.control import states
 from tightrope.control.environments import Environments
 from tightrope.control.normalise import Normalisers
 
 Array = np.ndarray
+
+
+def reset_seed(seed: int, step: int) -> int:
+    """The seed of a reset at an agent step; copy i of single environments adds i. At 0 the run's own."""
+    if step == 0:
+        return seed
+    return int(np.random.SeedSequence([seed, step]).generate_state(1)[0]) >> 2  # with i it fits 31 bits
 
 
 class BadNumbers(ValueError):
@@ -79,11 +87,30 @@ class Collector:
         )
         self._step_count = 0
 
-    def reset(self, seed: int) -> None:
-        """Begin all episodes anew."""
-        self._inputs, self._action_mask = self.environments.reset(seed)
+    def reset(self, seed: int, step: int) -> None:
+        """Begin all episodes anew at an agent step, with seeds of (seed, step) alone; those that were running
+        are cut: their last step was bootstrapped, and they are not counted.
+        """
+        self._inputs, self._action_mask = self.environments.reset(reset_seed(seed, step))
         self._returns = np.zeros(self.environments.num_envs)
         self._lengths = np.zeros(self.environments.num_envs, np.int64)
+        if self.normalisers.rewards is not None:
+            self.normalisers.rewards.restart(self.environments.num_envs)
+
+    def state(self) -> dict[str, Any] | None:
+        """The running episodes, as JSON can hold them; None when the environments cannot give their state."""
+        if not self.environments.gives_state:
+            return None
+        names = ("_inputs", "_action_mask", "_returns", "_lengths")
+        own = {name: states.pack(getattr(self, name)) for name in names}
+        return {**own, "environments": self.environments.get_state()}
+
+    def restore(self, seed: int, step: int, state: dict[str, Any]) -> None:
+        """Go on with the episodes of a `state`."""
+        self.environments.reset(reset_seed(seed, step))
+        self.environments.set_state(state["environments"])
+        for name in ("_inputs", "_action_mask", "_returns", "_lengths"):
+            setattr(self, name, states.unpack(state[name]))
 
     def noise(self, num_steps: int, rows: int, rng: np.random.Generator) -> Array:
         """[T, rows, A] float32: uniforms for categories and bits, standard normals for Gaussian columns."""

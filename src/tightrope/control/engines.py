@@ -41,11 +41,10 @@ class TorchEngine:
             if settings.compile
             else policy
         )
-        self._act_count = 0
 
     def begin_rollout(self, num_envs: int, rng: np.random.Generator) -> None:
-        """Remember what gSDE draws its matrices from."""
-        self._num_envs, self._rng = num_envs, rng
+        """Remember what gSDE draws its matrices from; the first act draws them."""
+        self._num_envs, self._rng, self._act_count = num_envs, rng, 0
 
     def act(
         self,

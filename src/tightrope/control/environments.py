@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, final
 import gymnasium as gym
 import numpy as np
 
-from tightrope.control import tasks
+from tightrope.control import states, tasks
 from tightrope.control.autoreset import VectorCopies, is_vector_env
 from tightrope.control.spaces import Inputs
 from tightrope.control.vector import EnvironmentFault, Step
@@ -94,6 +94,24 @@ class Environments:
         action mask.
         """
         return self._copies.reset(int(seed))
+
+    @property
+    def gives_state(self) -> bool:
+        """Whether the copies can give their state (see states.py)."""
+        copies = self._copies
+        return states.gives_state(copies._env if isinstance(copies, VectorCopies) else copies._own.envs[0])
+
+    def get_state(self) -> list[Any]:
+        """What the copies are in the middle of, as JSON can hold it; EnvironmentFault when it cannot."""
+        copies = self._copies
+        return copies.get_state() if isinstance(copies, VectorCopies) else states.of_copies(copies)
+
+    def set_state(self, found: list[Any]) -> None:
+        """Go on from what `get_state` gave, after a reset."""
+        if isinstance(self._copies, VectorCopies):
+            self._copies.set_state(found)
+        else:
+            states.into_copies(self._copies, found)
 
     def step(self, actions: np.ndarray) -> Step:
         """Act in every copy; ``actions`` [B, A] float32 as sampled, bounds are taken care of here."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from tightrope.control.presets import BY_TASK, preset
@@ -19,9 +20,10 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
         raise ValueError(f"algorithm is {algorithm!r}; expected one of: {', '.join(ALGORITHM_SETTINGS)}.")
     env_id = env if isinstance(env, str) else _name_of(env)
     if env_id in BY_TASK[algorithm]:
-        chosen = preset(env_id, algorithm)
+        chosen, limit = preset(env_id, algorithm), _time_limit(env)
     else:
-        chosen = preset(env_id, algorithm, *_describe(env))
+        kind, limit = _describe(env)
+        chosen = preset(env_id, algorithm, kind, limit)
     num_envs = getattr(env, "num_envs", None)  # a vector environment has its own number of copies
     if num_envs is not None:
         chosen["num_envs"] = int(num_envs)
@@ -29,7 +31,25 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
     sizes = (merged["num_envs"], merged["num_steps"])
     if algorithm == "ppo" and "minibatch_size" not in values and all(type(size) is int for size in sizes):
         chosen["minibatch_size"] = max(1, min(chosen.get("minibatch_size", 64), sizes[0] * sizes[1]))
+    if limit is not None and "checkpoint_every" not in values:
+        total = {"total_steps": TrainSettings.total_steps, **merged}["total_steps"]
+        if type(total) is int and total > 0 and type(sizes[0]) is int:
+            chosen["checkpoint_every"] = _room(limit * sizes[0] / total)
     return TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
+
+
+def _room(episode: float) -> float:
+    """The default of checkpoint_every, or more where the longest ``episode`` of all copies, as a share of the
+    run, takes more: environments begin anew on that grid, and their episodes shall be able to end before it.
+    """
+    return min(1.0, max(TrainSettings.checkpoint_every or 1.0, math.ceil(1000 * episode) / 1000))
+
+
+def _time_limit(env: Any) -> int | None:
+    from tightrope.control.tasks import find_spec
+
+    spec = find_spec(env) if isinstance(env, str) else getattr(env, "spec", None)
+    return getattr(spec, "max_episode_steps", None)
 
 
 def _name_of(env: Any) -> str:

@@ -123,3 +123,22 @@ def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: di
     agent.steps, agent.kl_beta = int(state["steps"]), state["kl_beta"]
     agent.sampling_rng.bit_generator.state = state["rng"]["sampling"]
     agent.update_rng.bit_generator.state = state["rng"]["update"]
+
+
+def resume_episodes(agent: Agent, state: dict[str, Any]) -> list[str]:
+    """Go on with the episodes that were running at a checkpoint, where its environments could give their
+    state; else, in a line, that they begin anew, as they do at this step in a run without a break.
+    """
+    episodes, seed = state.get("episodes"), agent.settings.seed
+    if not agent.steps:
+        return []
+    if episodes is not None and agent.environments.gives_state:
+        agent.collector.restore(seed, agent.steps, episodes)
+        agent.fresh = False
+        return []
+    what = f"{agent.environments.num_envs} environments begin anew at step {agent.steps:,}"
+    if episodes is not None:
+        return [
+            f"warning: {what}: the run's could give their state, these cannot, so that the end may differ."
+        ]
+    return [f"{what}, with seeds of (seed {seed}, step), as on every point of the checkpoint grid."]

@@ -101,7 +101,11 @@ class TrainSettings:
         10, "Episodes per evaluation, deterministic, on seeds of their own.", at_least=1
     )
     checkpoint_every: float | None = setting(
-        0.05, "Fraction of the run between checkpoints; none: only the last.", above=0, at_most=1
+        0.05,
+        "Fraction of the run between checkpoints; environments that cannot give their state begin anew "
+        "there, by default after an episode at least; none: only the last.",
+        above=0,
+        at_most=1,
     )
     keep_checkpoints: int | None = setting(
         3, "Checkpoints that are kept, the newest ones; the best policy always is. none: all.", at_least=2

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tightrope.control.agent import AGENTS, Agent, Progress
+from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.environments import Environments
 from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
-from tightrope.control.saving import rebuild, restore, save_agent, snapshot
+from tightrope.control.saving import rebuild, restore, resume_episodes, save_agent, snapshot
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
+from tightrope.runs import signals
 from tightrope.runs.durable import CannotWrite
+from tightrope.runs.grid import crosses
+from tightrope.runs.history import steps_in
 from tightrope.runs.run import Run, teller
 
 __all__ = ["resolve", "resume", "train"]
@@ -47,6 +49,9 @@ def train(
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
     with Run.create(run_dir, settings_to_json(settings), name, tensorboard=settings.tensorboard) as run:
+        if agent.policy.own is not None or not isinstance(source, str):
+            # settings.json alone could not give these first weights again
+            _save(agent, run, float("-inf"), 0.0, report)
         return _continue(agent, run, settings.total_steps, report, best=float("-inf"), wall=0.0)
 
 
@@ -58,29 +63,35 @@ def resume(
     env: Any = None,
     policy: Any = None,
 ) -> dict[str, Any]:
-    """Go on from the newest checkpoint: weights, optimiser, normalisers, random generators, schedules.
+    """Go on from the newest checkpoint, or from the start where there is none yet; the end is that of a run
+    without a break, bit for bit (docs/resume.md says what that takes).
 
-    ``total_steps`` extends a finished run. Episodes that were running at the checkpoint begin anew.
+    ``total_steps`` extends a finished run: schedules and grid run over the new budget from here on.
     """
     with Run.open(run_dir).lock() as run:
         return _resume(run, total_steps, report, env, policy)
 
 
 def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, policy: Any) -> dict[str, Any]:
-    run_dir, point = run.path, run.resume_point(teller(report))
-    state = point.state
-    settings = settings_from_json(state["settings"])
-    if env is None and (state["own_environment"] or ":" in settings.env):
+    run_dir = run.path
+    point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
+    state: dict[str, Any] = {} if point is None else point.state
+    settings = settings_from_json(state.get("settings", run.settings))
+    if env is None and (state.get("own_environment") or ":" in settings.env):
         raise ValueError(
             f"{run_dir} was trained on {settings.env!r}, which no file may import. Name your code again: "
             f"tightrope resume {run_dir} --env {settings.env}, with --env-module FILE.py where it is "
             "registered there."
         )
-    if total_steps is not None:
-        settings = settings.with_values(total_steps=total_steps)
+    # of a run that was extended and stopped before its next checkpoint, settings.json alone knows the budget
+    total_steps = int(run.settings["total_steps"]) if total_steps is None else total_steps
+    settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
     agent = rebuild(source, run_dir, policy=policy, settings=settings, notify=_notice(report))
-    restore(agent, point.tensors, state)
+    if point is not None:
+        restore(agent, point.tensors, state)
+        for line in resume_episodes(agent, state):
+            report("line", {"text": line})
     run.rewind(point)
     run.update_settings(settings_to_json(agent.settings))
     if agent.steps + settings.num_envs > settings.total_steps:
@@ -88,8 +99,8 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
             "line",
             {"text": f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there."},
         )
-    best = float("-inf") if state["best"] is None else state["best"]
-    return _continue(agent, run, settings.total_steps, report, best=best, wall=state["wall_seconds"])
+    best = float("-inf") if state.get("best") is None else state["best"]
+    return _continue(agent, run, settings.total_steps, report, best=best, wall=state.get("wall_seconds", 0.0))
 
 
 def _continue(
@@ -99,30 +110,27 @@ def _continue(
     settings, begin, wall_before = agent.settings, agent.steps, wall
     evaluator = _Evaluator(agent, run, report, best)
     report("start", _start(agent, run))
-    evaluate_at = _Grid(settings.evaluate_every, total_steps, begin)
-    save_at = _Grid(settings.checkpoint_every, total_steps, begin)
-    interrupt = Interrupt()
     try:
-        clock = time.perf_counter()
-        for progress in interrupt.between(agent.iterate(total_steps, start=0)):
-            wall += time.perf_counter() - clock
-            step, metrics = agent.steps, {**progress.metrics, "time/seconds": wall}
-            if evaluate_at.due(step):
-                metrics |= evaluator.evaluate()
-            run.record_episodes(
-                {"step": step, "return": r, "length": n, "terminated": t} for r, n, t in progress.episodes
-            )
-            run.record(step, wall, metrics)
-            report("update", {"step": step, "total_steps": total_steps, "metrics": metrics, "seconds": wall})
-            if save_at.due(step):
-                _save(agent, run, evaluator.best, wall, report)
-            clock = time.perf_counter()
-        final = evaluator.evaluate()
-        _save(agent, run, evaluator.best, wall, report, final=True)
-    except KeyboardInterrupt:
-        if not interrupt.torn:
+        with signals.stoppable():
+            clock, before = time.perf_counter(), begin
+            for progress in agent.iterate(total_steps, start=0):
+                wall += time.perf_counter() - clock
+                signals.check()
+                step, metrics = agent.steps, {**progress.metrics, "time/seconds": wall}
+                if crosses(before, min(step, total_steps - 1), total_steps, settings.evaluate_every):
+                    metrics |= evaluator.evaluate()
+                run.record_episodes(
+                    {"step": step, "return": r, "length": n, "terminated": t} for r, n, t in progress.episodes
+                )
+                run.record(step, wall, metrics)
+                report(
+                    "update", {"step": step, "total_steps": total_steps, "metrics": metrics, "seconds": wall}
+                )
+                if progress.on_grid:
+                    _save(agent, run, evaluator.best, wall, report)
+                clock, before = time.perf_counter(), step
+            final = evaluator.evaluate()
             _save(agent, run, evaluator.best, wall, report, final=True)
-        raise
     finally:
         evaluator.close()
         agent.close()
@@ -153,35 +161,6 @@ def _summary(agent: Agent, run: Run, wall: float, rate: float) -> dict[str, Any]
     return {**{name: getattr(settings, name) for name in names}, **numbers, "run_dir": str(run.path)}
 
 
-class Interrupt:
-    """Ctrl-C waits for the end of the update under way, so that what is saved is whole; a second one does not
-    wait.
-    """
-
-    def __init__(self) -> None:
-        self.asked, self.torn = False, False
-
-    def _ask(self, number: int, frame: Any) -> None:
-        if self.asked:
-            self.torn = True  # in the middle of an update: what is there now must not be saved
-            raise KeyboardInterrupt
-        self.asked = True
-
-    def between(self, updates: Iterator[Progress]) -> Iterator[Progress]:
-        """The updates, and KeyboardInterrupt after the first that was under way when Ctrl-C came."""
-        if threading.current_thread() is not threading.main_thread():
-            yield from updates  # only the main thread may handle signals
-            return
-        before = signal.signal(signal.SIGINT, self._ask)
-        try:
-            for progress in updates:
-                yield progress
-                if self.asked:
-                    raise KeyboardInterrupt
-        finally:
-            signal.signal(signal.SIGINT, before)
-
-
 class _Evaluator:
     """Periodic evaluation, outside the clock; keeps the best policy. Off when the environment cannot be
     copied.
@@ -193,14 +172,21 @@ class _Evaluator:
         if agent.settings.evaluate_every is None:
             return
         try:
-            episodes = agent.settings.evaluation_episodes
-            self.environments = evaluation_environments(agent.env, agent.settings, episodes)
+            self.environments = self._made()
         except ValueError as error:
             report("line", {"text": f"no evaluation while training: {error}"})
+
+    def _made(self) -> Environments:
+        settings = self.agent.settings
+        return evaluation_environments(self.agent.env, settings, settings.evaluation_episodes)
 
     def evaluate(self) -> dict[str, float]:
         if self.environments is None:
             return {}
+        if self.environments.gives_state:
+            # they may remember earlier evaluations, of which a run that was gone on with knows nothing
+            self.environments.close()
+            self.environments = self._made()
         result = evaluate_agent(self.agent, self.environments, self.agent.settings.evaluation_episodes)
         metrics = {
             "eval/mean_reward": result["mean_return"],
@@ -216,7 +202,8 @@ class _Evaluator:
     def _keep(self, mean: float) -> None:
         """Save the policy as the best; where the disk refuses, the best one is still the one before."""
         try:
-            save_agent(self.agent, self.run.best)
+            with signals.whole():
+                save_agent(self.agent, self.run.best)
         except CannotWrite as error:
             text = f"warning: The best policy is not saved: {error.what} {error.advice}. Training goes on."
             self.report("line", {"text": text})
@@ -228,23 +215,9 @@ class _Evaluator:
             self.environments.close()
 
 
-class _Grid:
-    """Steps at which something is due: multiples of a fraction of the run, the end left out."""
-
-    def __init__(self, fraction: float | None, total_steps: int, past: int) -> None:
-        count = 0 if fraction is None else int(1.0 / fraction)
-        points = [round(total_steps * (fraction or 0.0) * k) for k in range(1, count + 1)]
-        self.ahead = [point for point in points if past < point < total_steps]
-
-    def due(self, step: int) -> bool:
-        """Whether a point has been reached; several passed at once count as one."""
-        reached = bool(self.ahead) and step >= self.ahead[0]
-        self.ahead = [point for point in self.ahead if point > step]
-        return reached
-
-
 def _save(agent: Agent, run: Run, best: float, wall: float, report: Reporter, *, final: bool = False) -> None:
     tensors, state = snapshot(agent)
     state |= {"best": best, "wall_seconds": wall}
+    state["episodes"] = agent.collector.state() if agent.steps else None
     keep, say = agent.settings.keep_checkpoints, teller(report)
     run.save(agent.steps, tensors, state, keep=keep, say=say, final=final)

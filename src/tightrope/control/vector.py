@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from tightrope.control import spaces
+from tightrope.control import spaces, states
 from tightrope.control.nested import MASK_KEY
 from tightrope.control.spaces import (
     ActionLayout,
@@ -183,6 +183,23 @@ class EnvGroup:
         self._checked = True
         if has_masks:
             self._check_masks()
+
+    def get_state(self) -> list[Any]:
+        """The packed state of every copy (see states.py)."""
+        return [self._kept(row, states.state_of, env) for row, env in enumerate(self.envs)]
+
+    def set_state(self, found: list[Any]) -> None:
+        """Put packed states back into copies that have been reset."""
+        for row, (env, state) in enumerate(zip(self.envs, found, strict=True)):
+            self._kept(row, states.put_back, env, state)
+
+    def _kept(self, row: int, function: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except Exception as error:
+            what = f"the state of environment {self.first + row} ({self.name}) cannot be kept"
+            message = f"{what}: {type(error).__name__}: {error}."
+            raise EnvironmentFault(message, self.first + row, self._count) from error
 
     def _end(self, row: int, observation: Any, terminated: bool) -> tuple[Any, dict[str, Any]]:
         """Note how the episode ended, keep a truncation's last observation, and reset."""

@@ -29,6 +29,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
+from tightrope.control import states
 from tightrope.control.spaces import (
     ActionLayout,
     Inputs,
@@ -39,7 +40,9 @@ from tightrope.control.spaces import (
 from tightrope.control.tasks import check_alike, make_all
 from tightrope.control.vector import EnvGroup, EnvironmentFault, Slots, Step
 
-COMMAND = struct.Struct("<cq")  # what to do (r = reset, s = step, c = close) and the seed of a reset
+# what to do (r = reset, s = step, g = give states, p = put back states, c = close) and a number: the seed of
+# a reset, or the length of the states that follow
+COMMAND = struct.Struct("<cq")
 LENGTH = struct.Struct("<I")
 READY, MASKED, BROKEN = b"k", b"m", b"e"  # replies: fine, fine and there are action masks, JSON follows
 PATIENCE = 60.0  # seconds a worker may stay silent
@@ -287,6 +290,7 @@ def _work(channel: socket.socket, makers: Any, shared: Slots, first: int, name: 
     """
     # Ctrl-C reaches the whole process group; the parent ends its workers in order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not the parent's answer, which a fork brings along
     for inherited in list(
         _parent_ends
     ):  # else this process would keep other workers from seeing their parent die
@@ -298,8 +302,8 @@ def _work(channel: socket.socket, makers: Any, shared: Slots, first: int, name: 
         group = EnvGroup(envs, slots, name, first)
         check_slots(group, slots)
         channel.sendall(READY)
-        while _obey(channel, group, spin):
-            channel.sendall(MASKED if group.has_masks else READY)
+        while (more := _obey(channel, group, spin)) is not None:
+            channel.sendall((MASKED if group.has_masks else READY) + more)
     except (ConnectionError, EOFError):
         pass  # the parent is gone
     except Exception as error:
@@ -317,17 +321,19 @@ def _work(channel: socket.socket, makers: Any, shared: Slots, first: int, name: 
         channel.close()
 
 
-def _obey(channel: socket.socket, group: EnvGroup, spin: float) -> bool:
-    """Wait for one command and carry it out; False when it is time to stop."""
+def _obey(channel: socket.socket, group: EnvGroup, spin: float) -> bytes | None:
+    """Wait for one command and carry it out; what to send behind the reply, None when it is time to stop."""
     message = _receive_soon(channel, COMMAND.size, spin)
-    if len(message) < COMMAND.size:
-        return False
-    command, seed = COMMAND.unpack(message)
+    command, number = COMMAND.unpack(message) if len(message) == COMMAND.size else (b"c", 0)
     if command == b"r":
-        group.reset(seed)
+        group.reset(number)
     elif command == b"s":
         group.step()
-    return command != b"c"
+    elif command == b"p":
+        states.taken(channel, group, number)
+    elif command == b"g":
+        return states.told(group)
+    return None if command == b"c" else b""
 
 
 def check_slots(group: EnvGroup, slots: Slots) -> None:

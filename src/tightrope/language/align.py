@@ -17,6 +17,7 @@ from tightrope.language.kl import bias_of
 from tightrope.language.saving import restore_state
 from tightrope.language.settings import NOT_HERE, AlignSettings
 from tightrope.language.trainer import Aligned, Trainer
+from tightrope.runs.history import steps_in
 from tightrope.runs.run import Run, teller
 
 __all__ = ["Aligned", "align", "resume_align"]
@@ -82,8 +83,8 @@ def resume_align(
     total_episodes: int | None = None,
     report: Reporter = silent,
 ) -> Aligned:
-    """Go on from a run's newest checkpoint: adapters, critic, optimiser, kl_beta, prompt order, random
-    numbers.
+    """Go on from a run's newest checkpoint, or from the start where there is none yet; the end is that of a
+    run without a break, bit for bit.
 
     Code is never named by a file: a reward that was a function must be given again, and prompts that were no
     file too. ``total_episodes`` extends a finished run.
@@ -113,8 +114,10 @@ def resume_align(
     )
     with run.lock():
         trainer = Trainer(settings, *sources, report)
-        point = run.resume_point(teller(report))
-        restore_state(trainer, point)
+        point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
+        if point is not None:
+            restore_state(trainer, point)
+        trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
         run.rewind(point)
         run.update_settings(dataclasses.asdict(settings))
         return trainer.run(run)

@@ -36,6 +36,8 @@ from tightrope.language.models import (
 )
 from tightrope.language.saving import Progress, load_progress, put_back, save_progress, tensors_of
 from tightrope.language.settings import SupervisedSettings
+from tightrope.runs import signals
+from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run, teller
 
 Item = TypeVar("Item")
@@ -71,7 +73,7 @@ def prepared(
     the settings' threads at work. ValueError for a device that is not there.
     """
     require_device(settings.device)
-    with threads(settings.threads):
+    with threads(settings.threads), signals.stoppable():
         present_memory(settings, given, report)
         loaded = load(settings, adapter, given)
         with lora.using(loaded.model, loaded.adapter):
@@ -232,6 +234,7 @@ def fit(
         now.newest |= first
         run.record(0, 0.0, first)
     for minibatch in islice(minibatches(items, settings), now.step, None):
+        signals.check()
         clock = time.perf_counter()
         rate = scheduled(settings.learning_rate, settings.learning_rate_schedule, now.step / total)
         optimiser.param_groups[0]["lr"] = rate
@@ -249,7 +252,7 @@ def fit(
         run.record(now.step, now.seconds, metrics)
         event = {"step": now.step, "metrics": metrics, "seconds": now.seconds}
         report("update", {**event, "total_steps": total})
-        if now.step == total or reaches(now.step, total, settings.checkpoint_every):
+        if now.step == total or crosses(now.step - 1, now.step, total, settings.checkpoint_every):
             keep, say, final = settings.keep_checkpoints, teller(report), now.step == total
             save_progress(run, now, tensors_of(parameters, optimiser), keep=keep, say=say, final=final)
     return now.newest
@@ -262,13 +265,6 @@ def minibatches(items: Sequence[Item], settings: SupervisedSettings) -> Iterator
         order = rng.permutation(len(items))
         for start in range(0, len(items), size):
             yield [items[i] for i in order[start : start + size]]
-
-
-def reaches(step: int, total: int, fraction: float | None) -> bool:
-    """Whether this step comes to a point of the grid ``fraction``, 2 ``fraction``, ... of the run."""
-    if fraction is None:
-        return False
-    return int(step / total / fraction + 1e-9) > int((step - 1) / total / fraction + 1e-9)
 
 
 def take_step(

@@ -76,7 +76,8 @@ def save_state(trainer: Trainer, run: Run, *, final: bool = False) -> None:
         "prompt_position": trainer.order.position,
         "rng": {"update": trainer.update_rng.bit_generator.state},
         "monitor": trainer.monitor.state(),
-        "gold_point": trainer.gold_grid.point,
+        "stopped": trainer.stopped,
+        "newest": trainer.newest,
         "seconds": trainer.seconds,
     }
     if trainer.pretraining is not None:
@@ -97,7 +98,8 @@ def restore_state(trainer: Trainer, point: Checkpoint) -> None:
     trainer.order.position = int(state["prompt_position"])
     trainer.update_rng.bit_generator.state = state["rng"]["update"]
     trainer.monitor.restore(state["monitor"])
-    trainer.gold_grid.point, trainer.seconds = state["gold_point"], float(state["seconds"])
+    trainer.stopped, trainer.seconds = bool(state["stopped"]), float(state["seconds"])
+    trainer.newest = {name: math.nan if x is None else x for name, x in state["newest"].items()}
     if trainer.pretraining is not None:
         trainer.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 

@@ -38,6 +38,8 @@ from tightrope.language.scoring import (
 )
 from tightrope.language.settings import AlignSettings
 from tightrope.maths.values import explained_variance
+from tightrope.runs import signals
+from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run
 
 LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
@@ -95,8 +97,8 @@ class Trainer:
         self.pretraining = Pretraining.make(settings, self.roles) if settings.ptx_weight else None
         self.monitor = Monitor(kl_budget=settings.kl_budget)
         self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
-        self.gold_grid, self._told = Grid(settings.evaluate_every, from_start=True), set[tuple[str, str]]()
-        self.seconds = 0.0
+        self.seconds, self.newest = 0.0, dict[str, float]()
+        self._told = set[tuple[str, str]]()
 
     def _read_prompts(self, source: Any) -> list[Prompt]:
         settings, limit = self.settings, context_length(self.roles.model)
@@ -122,27 +124,41 @@ class Trainer:
         total = {"total_steps": settings.total_episodes}
         facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self._lines()}
         self.report("start", {"settings": dataclasses.asdict(settings), **facts, **total})
-        saves = Grid(settings.checkpoint_every, from_start=False)
-        saves.due(self.episodes / settings.total_episodes)  # a run that goes on has been there
-        metrics: dict[str, float] = {}
-        with run:
+        with run, signals.stoppable():
             for metrics, rows in self.iterate():
+                signals.check()
                 metrics["time/seconds"] = self.seconds = time.perf_counter() - begin
                 self._watch(metrics)
+                self.newest = metrics
                 run.record(self.episodes, metrics["time/seconds"], metrics)
                 run.record_samples(rows)
                 event = {"step": self.episodes, "metrics": metrics, "seconds": metrics["time/seconds"]}
                 self.report("update", {**event, **total})
-                if saves.due(self.episodes / settings.total_episodes):
-                    if self.episodes < settings.total_episodes:  # the end has a save of its own
+                if self._reached(settings.checkpoint_every):
+                    if self._next_prompts():
                         save_state(self, run)
                     self.report("samples", {"step": self.episodes, "rows": rows})
             save_state(self, run, final=True)
             save_model(self.roles, run.path, settings)
-            summary = self._summary(run, metrics)
+            summary = self._summary(run, self.newest)
             run.finish(summary)
         self.report("finish", summary)
         return Aligned(run.path, summary, run.read_metrics())
+
+    def _next_prompts(self) -> int:
+        """Prompts of the next iteration; 0 at the end of the budget."""
+        if self.stopped:
+            return 0
+        left = self.settings.total_episodes - self.episodes
+        return max(0, min(self.settings.batch_size, left)) // self.settings.samples_per_prompt
+
+    def _reached(self, fraction: float | None) -> bool:
+        """Whether the newest iteration, which like all but the last one was of the full size, came to a point
+        of this grid.
+        """
+        samples = self.settings.samples_per_prompt
+        before = self.episodes - self.settings.batch_size // samples * samples
+        return crosses(max(0, before), self.episodes, self.settings.total_episodes, fraction)
 
     def _watch(self, metrics: dict[str, float]) -> None:
         """Over-optimisation: warn, and stop at the KL budget."""
@@ -180,12 +196,7 @@ class Trainer:
 
     def iterate(self) -> Iterator[tuple[dict[str, float], list[dict[str, Any]]]]:
         """One iteration at a time: its metrics, and its rows for samples.jsonl."""
-        samples = self.settings.samples_per_prompt
-        while self.episodes < self.settings.total_episodes and not self.stopped:
-            left = self.settings.total_episodes - self.episodes
-            count = min(self.settings.batch_size, left) // samples
-            if count == 0:
-                return
+        while count := self._next_prompts():
             yield self._one_iteration([self.prompts[i] for i in self.order.take(count)])
 
     def _one_iteration(self, prompts: Sequence[Prompt]) -> tuple[dict[str, float], list[dict[str, Any]]]:
@@ -205,7 +216,7 @@ class Trainer:
         share = kl_share(experience, settings, self.kl_beta)
         metrics = describe(experience, scores, rewards, share, valid) | scores.metrics
         self._check_sampling(metrics["objective/sampling_gap"])
-        if self.gold is not None and self.gold_grid.due(self.episodes / settings.total_episodes):
+        if self.gold is not None and (not self.episodes or self._reached(settings.evaluate_every)):
             metrics["eval/gold"] = self.evaluate()  # of the policy whose KL this rollout tells
         if len(batch):
             metrics |= self._update(batch, present)
@@ -314,18 +325,3 @@ def hold_out(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prom
         )
     kept = {prompt.tokens for prompt in held}
     return [prompt for prompt in prompts if prompt.tokens not in kept], held
-
-
-class Grid:
-    """Points 0 or ``fraction``, then every ``fraction`` of a run; ``point`` is the next, None for none."""
-
-    def __init__(self, fraction: float | None, *, from_start: bool) -> None:
-        self.fraction = fraction
-        self.point = fraction if fraction is None or not from_start else 0.0
-
-    def due(self, share: float) -> bool:
-        """Whether the next point was reached; it then moves on."""
-        if self.fraction is None or self.point is None or share < self.point - 1e-9:
-            return False
-        self.point = (int(share / self.fraction + 1e-9) + 1) * self.fraction
-        return True

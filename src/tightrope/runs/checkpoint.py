@@ -12,15 +12,14 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import platform
 import re
 import stat
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tightrope.runs import tensors as safetensors_file
+from tightrope.runs import versions
 from tightrope.runs.durable import present, whole, write_file
 from tightrope.runs.records import canonical, dumps, read_json
 
@@ -32,7 +31,6 @@ VERSION = 2
 READS = 5  # of a folder that is replaced while it is read
 _STEM = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _STEP_FOLDER = re.compile(r"step-(\d{12})")
-_LIBRARIES = ("torch", "numpy", "gymnasium", "transformers")
 _ADVICE = "The checkpoint is damaged or was changed: use another one, or train again."
 
 
@@ -49,28 +47,6 @@ def step_of(folder: Path) -> int:
     """The step in a checkpoint folder's name; -1 for another name."""
     match = _STEP_FOLDER.fullmatch(folder.name)
     return int(match.group(1)) if match else -1
-
-
-def versions() -> dict[str, str]:
-    """Those of Python, of this library, and of the libraries that are loaded."""
-    from importlib import metadata
-
-    try:
-        own = metadata.version("tightrope")
-    except metadata.PackageNotFoundError:
-        own = "not installed"
-    loaded = {name: str(sys.modules[name].__version__) for name in _LIBRARIES if name in sys.modules}
-    return {"python": platform.python_version(), "tightrope": own, **loaded}
-
-
-def changed_versions(folder: Path) -> str:
-    """The libraries that a checkpoint was written with in another version than is loaded now, in words."""
-    written, now = read_manifest(present(folder)).get("versions"), versions()
-    known = written if isinstance(written, dict) else {}
-    found = [
-        f"{name} {known[name]} (now {now[name]})" for name in now if known.get(name, now[name]) != now[name]
-    ]
-    return ", ".join(found)
 
 
 # ---------------------------------------------------------------------------- writing
@@ -105,7 +81,7 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
             "version": VERSION,
             "step": step_of(folder) if step_of(folder) >= 0 else None,
             "files": files,
-            "versions": versions(),
+            "versions": versions.known(),
             "settings_sha256": _hash(state["settings"]) if "settings" in state else None,
         }
         write_file(temporary / "manifest.json", [_manifest_text(manifest)], sync=False)

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from tightrope.runs import checkpoint, durable, history, metrics
+from tightrope.runs import checkpoint, durable, history, metrics, signals, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import CannotWrite, sync_folder, writing
 from tightrope.runs.folders import fresh, require_free, why_not
@@ -180,8 +180,23 @@ class Run:
 
         What was recorded is on the disk before the checkpoint can be seen, which keeps its length. What the
         disk refuses is said and training goes on, unless this is the ``final`` one, or asked for by somebody:
-        then CannotWrite is raised. ``settings``, ``records`` and ``merit`` are added to ``state``.
+        then CannotWrite is raised. ``settings``, ``records`` and ``merit`` are added to ``state``. A signal
+        waits for the end.
         """
+        with signals.whole():
+            self._save(step, tensors, state, keep=keep, say=say, merit=merit, final=final)
+
+    def _save(
+        self,
+        step: int,
+        tensors: dict[str, dict[str, Tensor]],
+        state: dict[str, Any],
+        *,
+        keep: int | None,
+        say: Callable[[str], None],
+        merit: float | None,
+        final: bool,
+    ) -> None:
         self.lock()
         folder, clock = self.checkpoint_folder(step), time.perf_counter()
         try:
@@ -234,8 +249,9 @@ class Run:
             say(f"the run was left without an end by {self._lock.left_by}")
         self._put_aside_a_damaged_best(say)
         point = history.valid(self.checkpoints, lambda text: say(f"warning: {text}"), self._check_records)
-        if changed := checkpoint.changed_versions(point.folder):
-            say(f"warning: {point.folder} was written with {changed}: the same bits are not promised.")
+        manifest = checkpoint.read_manifest(durable.present(point.folder))
+        if changed := versions.differences(manifest.get("versions")):
+            say(f"warning: {changed} since the checkpoint: the run goes on, but its last bits may differ.")
         return point
 
     def _put_aside_a_damaged_best(self, say: Callable[[str], None]) -> None:

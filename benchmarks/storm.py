@@ -1,0 +1,391 @@
+"""Kill storms: a run that is killed again and again, and gone on with each time, ends as one that never was.
+
+    python benchmarks/storm.py --kills 50 --stories cartpole pendulum
+    python benchmarks/storm.py --kills 25 --stories language
+    python benchmarks/storm.py --cost
+
+Every kill is a SIGKILL, at a moment that a seed draws: some milliseconds after the k-th update of a process,
+or inside a save, which a shim of this script, not of the library, makes slow. Nobody helps in between. The
+storm notes the newest valid checkpoint at each kill and fails unless the resumed process begins there and its
+first new row is the one that follows; when the run is at its end, all that it left is compared: SHA-256 of
+weights, optimiser and normalisers, generators and counters, and every row of every .jsonl file, but for
+``seconds`` and ``time/*``. A run that ends before all kills are spent is followed by another one.
+
+Processes are forked from this one, which has imported the library and never trained: importing it is most of
+the time of a short process, and nothing that a resume may rest on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+SLOW = 0.03  # seconds more for every fsync of a save that is to be killed; a save has half a dozen
+WAIT = 900.0  # seconds for a process to say anything
+CLOCKS = ("seconds", "wall_seconds")
+
+
+# ------------------------------------------------------------------------------------- the runs
+
+
+def control(env: str, **values: Any) -> Callable[[Path, Any], None]:
+    """A small run on a Gymnasium task, from its start, or gone on with where there is one."""
+    common = {"num_envs": 4, "num_steps": 64, "seed": 1, "evaluation_episodes": 2, "threads": 1}
+
+    def run(folder: Path, report: Any) -> None:
+        from tightrope.control.resolve import resolve
+        from tightrope.control.train import resume, train
+
+        if (folder / "settings.json").exists():
+            resume(folder, report=report)
+        else:
+            train(resolve(env, "ppo", {**common, **values}), run_dir=folder, report=report)
+
+    return run
+
+
+def letters(prompts: list[str], completions: list[str], **columns: Any) -> list[float]:
+    """The reward of the language storm: the share of a to m."""
+    return [sum(c in "abcdefghijklm" for c in text) / 8 for text in completions]
+
+
+def language(folder: Path, report: Any) -> None:
+    """PPO on a random Llama of two layers: value head, reference, KL controller, shuffled prompts."""
+    from tightrope.language.align import align, resume_align
+
+    prompts = ["".join(random.Random(k).choices("abcdefghijklmnop", k=1 + k % 5)) for k in range(11)]
+    given = {"prompts": prompts, "reward": letters, "report": report}
+    if (folder / "settings.json").exists():
+        resume_align(folder, **given)
+        return
+    align(
+        model=tiny_llama(folder.parent / "llama"), run_dir=folder, total_episodes=320, batch_size=16,
+        minibatch_size=8, max_new_tokens=8, lora_rank=4, learning_rate=1e-2, seed=1, critic="head",
+        kl_goal=1.0, kl_horizon=200.0, checkpoint_every=0.1, threads=1, **given,
+    )  # fmt: skip
+
+
+def tiny_llama(folder: Path) -> str:
+    """A model folder with random weights and a tokenizer of single characters."""
+    if (folder / "config.json").exists():
+        return str(folder)
+    import torch
+    from tokenizers import Regex, Tokenizer, decoders, models, pre_tokenizers
+    from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
+
+    torch.manual_seed(0)
+    words = ["<pad>", "<unk>", "<bos>", "<eos>", *"abcdefghijklmnopqrstuvwxyz ."]
+    config = LlamaConfig(
+        vocab_size=len(words), hidden_size=32, intermediate_size=48, num_hidden_layers=2,
+        num_attention_heads=4, num_key_value_heads=2, head_dim=8, max_position_embeddings=128,
+        tie_word_embeddings=True, bos_token_id=2, eos_token_id=3, pad_token_id=0, initializer_range=0.2,
+    )  # fmt: skip
+    LlamaForCausalLM(config).save_pretrained(folder)
+    inner = Tokenizer(models.WordLevel({w: i for i, w in enumerate(words)}, unk_token="<unk>"))
+    inner.pre_tokenizer = pre_tokenizers.Split(Regex("[\\s\\S]"), "isolated")
+    inner.decoder = decoders.Fuse()
+    special = {"pad_token": "<pad>", "unk_token": "<unk>", "bos_token": "<bos>", "eos_token": "<eos>"}
+    PreTrainedTokenizerFast(tokenizer_object=inner, **special).save_pretrained(folder)
+    return str(folder)
+
+
+BASE = {"minibatch_size": 128, "num_epochs": 2, "checkpoint_every": 0.1, "evaluate_every": 0.15}
+NORMALISED = {"normalise_observations": True, "normalise_rewards": True}
+STORIES: dict[str, Callable[[Path, Any], None]] = {
+    "cartpole": control("CartPole-v1", total_steps=8192, **BASE),
+    "pendulum": control("Pendulum-v1", total_steps=8192, **BASE, **NORMALISED),
+    "language": language,
+}
+
+
+# ------------------------------------------------------------------------------------- processes
+
+
+class Process:
+    """A forked process that trains ``folder``; it tells of its start, each update, each save and its end."""
+
+    def __init__(self, story: str, folder: Path, slow: bool) -> None:
+        ours, theirs = os.pipe()
+        self.pid = os.fork()
+        if not self.pid:
+            os.close(ours)
+            os._exit(_live(story, folder, slow, theirs))
+        os.close(theirs)
+        self._lines = _lines(ours)
+
+    def events(self) -> Iterator[tuple[str, int]]:
+        """(what, step) until the process has ended; RuntimeError when it failed."""
+        for line in self._lines:
+            what, step = line.split()
+            yield what, int(step)
+        _, status = os.waitpid(self.pid, 0)
+        if status:
+            raise RuntimeError(f"a process of the storm failed with status {status}; what it said is above")
+
+    def kill(self) -> None:
+        """SIGKILL, and wait until it is gone."""
+        os.kill(self.pid, signal.SIGKILL)
+        os.waitpid(self.pid, 0)
+
+
+def _lines(descriptor: int) -> Iterator[str]:
+    with os.fdopen(descriptor, encoding="ascii") as file:
+        yield from file
+
+
+def _live(story: str, folder: Path, slow: bool, out: int) -> int:
+    """The life of a forked process."""
+    from tightrope.runs import checkpoint
+
+    def tell(what: str, step: int) -> None:
+        os.write(out, f"{what} {step}\n".encode())
+
+    def report(event: str, data: dict[str, Any]) -> None:
+        if event in ("start", "update"):
+            tell(event, int(data["step"]))
+
+    save, sync = checkpoint.save, os.fsync
+
+    def told(place: Path, *arguments: Any, **more: Any) -> Path:
+        tell("save", max(0, checkpoint.step_of(Path(place))))
+        if slow:
+            os.fsync = lambda descriptor: (time.sleep(SLOW), sync(descriptor))[1]
+        found = save(place, *arguments, **more)
+        tell("saved", max(0, checkpoint.step_of(Path(place))))
+        return found
+
+    checkpoint.save = told
+    try:
+        STORIES[story](folder, report)
+        return 0
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+        return 1
+
+
+# ------------------------------------------------------------------------------------- the storm
+
+
+def newest(folder: Path) -> int:
+    """The step of the newest valid checkpoint; 0 where there is none."""
+    from tightrope.runs import checkpoint
+    from tightrope.runs.run import Run
+
+    try:
+        return checkpoint.step_of(Run.open(folder).newest().folder)
+    except ValueError:
+        return 0
+
+
+def storm(story: str, kills: int, seed: int, deadline: float, base: Path) -> dict[str, Any]:
+    """Kill runs of one story ``kills`` times, or until the deadline; every run that was begun is finished."""
+    draw = random.Random(f"{story} {seed}")
+    whole = base / story / "whole"
+    list(Process(story, whole, slow=False).events())
+    wanted, log, rounds = left(whole), [], 0
+    steps = [row["step"] for row in wanted["rows"]["metrics.jsonl"]]
+    while len(log) < kills and time.monotonic() < deadline:
+        folder, rounds, ended = base / story / f"run-{rounds}", rounds + 1, False
+        while not ended:
+            more = len(log) < kills and time.monotonic() < deadline
+            plan = planned(draw) if more else None
+            begin, killed = newest(folder) if folder.exists() else 0, False
+            process = Process(story, folder, slow=bool(plan and plan["inside"]))
+            first, killed = follow(process, plan)
+            check_first(story, begin, first, steps)
+            if killed is None:
+                ended = True
+                continue
+            log.append({"kill": len(log) + 1, "run": rounds, **plan, **killed, "newest": newest(folder)})
+            print(f"{story}: {json.dumps(log[-1])}", flush=True)
+        compare(story, wanted, left(folder))
+        shutil.rmtree(folder)
+    inside = sum(entry["inside"] for entry in log)
+    print(
+        f"{story}: {len(log)} kills, {inside} inside a save, {rounds} runs, every one bit-equal", flush=True
+    )
+    found = {"kills": len(log), "inside_a_save": inside, "runs": rounds, "all_equal": True}
+    return {**found, "rows": len(steps), "sha256": wanted["sha256"], "log": log}
+
+
+def planned(draw: random.Random) -> dict[str, Any]:
+    """The next kill: in the k-th save from the start of the process, or after its k-th update."""
+    inside = draw.random() < 0.5
+    after = draw.choice([1, 2, 2, 3]) if inside else draw.choice([0, 1, 2, 3, 5, 7])
+    return {
+        "inside": inside,
+        "after": after,
+        "delay": round(draw.uniform(0, 6 * SLOW if inside else 0.05), 4),
+    }
+
+
+def follow(process: Process, plan: dict[str, Any] | None) -> tuple[dict[str, int], dict[str, Any] | None]:
+    """Watch a process, and kill it as planned: where it began and its first row, and what was killed."""
+    first, count = dict[str, int](), 0
+    for what, step in process.events():
+        if what in ("start", "update"):
+            first.setdefault(what, step)
+        if plan is None:
+            continue
+        count += what == ("save" if plan["inside"] else "update")
+        if count == plan["after"] and what in (("save",) if plan["inside"] else ("start", "update")):
+            time.sleep(plan["delay"])
+            process.kill()
+            unread = [line.split()[0] for line in process._lines]
+            # a save that was over when the signal came was none to be killed in
+            return first, {"step": step, "inside": plan["inside"] and "saved" not in unread}
+    return first, None
+
+
+def check_first(story: str, begin: int, first: dict[str, int], steps: list[int]) -> None:
+    """Fail unless a process began at the newest checkpoint, and its first row is the one that follows it."""
+    row = next((step for step in steps if step > begin), None)
+    if first.get("start", begin) != begin or first.get("update", row) != row:
+        raise SystemExit(f"{story}: a resume from checkpoint {begin} began with {first}, expected row {row}")
+
+
+def left(folder: Path) -> dict[str, Any]:
+    """What a finished run leaves: hashes of its tensors and of its state but for clocks, and its rows."""
+    from tightrope.runs.run import Run
+
+    last = Run.open(folder).newest().folder
+    found = {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in last.glob("*.safetensors")}
+    state = without_clocks(json.loads((last / "state.json").read_text()))
+    found["state"] = hashlib.sha256(json.dumps(state, sort_keys=True).encode()).hexdigest()
+    rows = {}
+    for path in sorted(folder.glob("*.jsonl")):
+        rows[path.name] = [without_clocks(json.loads(line)) for line in path.read_text().splitlines()]
+    return {"checkpoint": last.name, "sha256": found, "rows": rows}
+
+
+def without_clocks(value: Any) -> Any:
+    """A JSON value without what clocks put into it."""
+    if isinstance(value, list):
+        return [without_clocks(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    # a checkpoint keeps how long the files were; rows of other durations have other lengths
+    kept = {k: v for k, v in value.items() if k not in (*CLOCKS, "records") and not k.startswith("time/")}
+    return {k: without_clocks(v) for k, v in kept.items()}
+
+
+def compare(story: str, wanted: dict[str, Any], found: dict[str, Any]) -> None:
+    """Fail at the first difference."""
+    for name in ("checkpoint", "sha256", "rows"):
+        if wanted[name] != found[name]:
+            raise SystemExit(
+                f"{story}: {name} differ from the run without a break:\n{wanted}\n{found}"[:4000]
+            )
+
+
+# ------------------------------------------------------------------------------------- what the grid costs
+
+
+def cost(base: Path, steps: int) -> dict[str, Any]:
+    """Seconds of a grid point of CartPole-v1 at default settings: save, sync, and environments anew."""
+    from tightrope.control import train
+    from tightrope.control.collect import Collector
+    from tightrope.control.resolve import resolve
+
+    spent = {"save": [], "reset": []}
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **more: Any) -> Any:
+            begin = time.perf_counter()
+            found = function(*arguments, **more)
+            spent[name].append(time.perf_counter() - begin)
+            return found
+
+        return call
+
+    train._save, Collector.reset = timed("save", train._save), timed("reset", Collector.reset)
+    settings = resolve("CartPole-v1", "ppo", {"total_steps": steps, "seed": 1, "evaluate_every": None})
+    begin = time.perf_counter()
+    train.train(settings, run_dir=base / "cost")
+    wall = time.perf_counter() - begin
+    point = sum(spent["save"]) / len(spent["save"]) + sum(spent["reset"]) / len(spent["reset"])
+    return {
+        "steps": steps, "wall_seconds": round(wall, 2), "points": len(spent["save"]),
+        "seconds_a_point": round(point, 5),
+        "share_of_this_run": round(sum(map(sum, spent.values())) / wall, 5),
+        "share_of_ten_minutes": round(20 * point / 600, 6),
+    }  # fmt: skip
+
+
+def main(words: list[str] | None = None) -> int:
+    """Run the storms that are asked for, and write what happened."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--stories", nargs="+", choices=[*STORIES], default=[*STORIES])
+    parser.add_argument("--kills", type=int, default=25, help="of each story")
+    parser.add_argument("--minutes", type=float, default=60.0, help="after which no more is killed")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cost", type=int, metavar="STEPS", help="measure the default grid instead")
+    parser.add_argument("--out", type=Path, help="JSON to write, or to add to")
+    given = parser.parse_args(words)
+    import torch
+
+    torch.set_num_threads(1)
+    from tightrope.runs.versions import known
+
+    found = json.loads(given.out.read_text()) if given.out and given.out.exists() else {"stories": {}}
+    deadline = time.monotonic() + 60 * given.minutes
+    command = " ".join(["python", "benchmarks/storm.py", *(sys.argv[1:] if words is None else words)])
+    with tempfile.TemporaryDirectory(prefix="storm-") as base:
+        if given.cost:
+            found["cost"] = {"command": command, **cost(Path(base), given.cost)}
+            print(json.dumps(found["cost"]))
+        for story in () if given.cost else given.stories:
+            warm(story)
+            begin = time.monotonic()
+            result = storm(story, given.kills, given.seed, deadline, Path(base))
+            seconds = round(time.monotonic() - begin, 1)
+            found["stories"][story] = {"command": command, "seconds": seconds, **known(), **result}
+            write(given.out, found)
+    write(given.out, found)
+    return 0
+
+
+def write(out: Path | None, found: dict[str, Any]) -> None:
+    """The results as JSON, one line for every kill."""
+    if out is not None:
+        text = json.dumps(found, indent=1)
+        out.write_text(
+            re.sub(r"\{\s+(\"kill\":[^}]*?)\s+\}", lambda m: "{" + " ".join(m[1].split()) + "}", text) + "\n"
+        )
+
+
+def warm(story: str) -> None:
+    """Import what the story's processes need."""
+    if story == "language":
+        import transformers
+
+        import tightrope.language.align
+
+        transformers.utils.logging.disable_progress_bar()
+    else:
+        import gymnasium
+
+        import tightrope.control.engine.fused
+        import tightrope.control.train  # noqa: F401
+
+        gymnasium.make("CartPole-v1").close()
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT / "src"))
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""SIGINT and SIGTERM: a run stops at once, but for a save under way, which is finished first.
+
+Nothing is saved because of a signal: checkpoints lie where the settings put them, so that a run which was
+stopped and gone on with ends as one without a break. A second signal does not wait for the save either.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+from tightrope.runs import checkpoint
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asked the run to stop; ``code`` is the exit code that says so: 130 or 143."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.code = 128 + number
+
+
+class _Answer:
+    """What this process does about a signal; signals belong to the process, and so does this."""
+
+    def __init__(self) -> None:
+        self.active = False
+        self.asked: int | None = None  # the signal that came
+        self.saves = 0  # how many saves are inside each other
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        first, self.asked = self.asked is None, number
+        if not (first and self.saves):
+            raise Stopped(number)
+
+
+_answer = _Answer()
+
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[None]:
+    """Inside, SIGINT and SIGTERM raise `Stopped`, in `whole` at its end; a second one raises it at once.
+
+    Only the main thread may handle signals: in another one nothing changes, and neither inside another
+    `stoppable`.
+    """
+    if _answer.active or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, _answer) for number in (signal.SIGINT, signal.SIGTERM)}
+    _answer.active, _answer.asked, _answer.saves = True, None, 0
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+        _answer.active = False
+
+
+@contextlib.contextmanager
+def whole() -> Iterator[None]:
+    """Around a save: a signal that comes inside is answered when the save is complete."""
+    check()
+    _answer.saves += 1
+    try:
+        yield
+    finally:
+        _answer.saves -= 1
+    check()
+
+
+def check() -> None:
+    """Raise `Stopped` when a signal has come that someone's code has swallowed, or that came in `whole`."""
+    if _answer.active and _answer.asked is not None and not _answer.saves:
+        raise Stopped(_answer.asked)
+
+
+def farewell(error: BaseException, run: str | None, step: int, what: str, command: str) -> str:
+    """What to tell of a ``run`` (None: not begun) that was stopped at ``step``: its newest valid checkpoint,
+    what will be repeated, and the ``command`` that goes on. ``what`` is counted: steps, responses.
+    """
+    by = f" by {error}" if isinstance(error, Stopped) else ""
+    if run is None:
+        return f"Stopped{by} before the run began."
+    text = f"Stopped{by} at {what.removesuffix('s')} {step:,}. "
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of damaged ones the command that goes on will tell
+        folder = newest(run)
+    if folder is None:
+        text += f"There is no checkpoint yet: all {step:,} {what} will be repeated."
+    else:
+        saved = max(0, step - checkpoint.step_of(folder))
+        text += f"The newest valid checkpoint is {folder}; {saved:,} {what} since then will be repeated."
+    return f"{text} Go on with:\n  {command}"
+
+
+def newest(run: str) -> Path | None:
+    """The folder of a run's newest valid checkpoint; None where there is none."""
+    from tightrope.runs.run import Run  # which has its saves wrapped in `whole`
+
+    try:
+        return Run.open(run).newest().folder
+    except ValueError:
+        return None
+
+
+def code_of(error: BaseException) -> int:
+    """The exit code of a command that was stopped: 130 for Ctrl-C, 143 for SIGTERM."""
+    return error.code if isinstance(error, Stopped) else 130

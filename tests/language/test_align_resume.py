@@ -1,0 +1,155 @@
+"""An alignment run that is killed at any moment and gone on with ends with the bits of one that was not."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from language.tiny import saved, tiny_llama
+
+from tightrope.cli import main
+from tightrope.language import trainer
+from tightrope.language.align import align, resume_align
+from tightrope.language.trainer import Trainer
+from tightrope.runs import checkpoint, signals
+from tightrope.runs.run import Run
+
+PROMPTS = ["ab", "cde", "f", "ghij", "kl", "mno", "p"]
+SMALL = {
+    "total_episodes": 56, "batch_size": 8, "minibatch_size": 4, "max_new_tokens": 4, "lora_rank": 2,
+    "seed": 1, "learning_rate": 1e-2, "checkpoint_every": 0.25, "evaluate_every": 0.3, "kl_goal": 1.0,
+    "threads": 1, "kl_horizon": 50.0, "held_out_prompts": 1, "ptx_weight": 0.1, "critic": "adapter",
+}  # fmt: skip
+
+
+class Killed(BaseException):
+    """What ends a run at once."""
+
+
+def letters(completions: list[str], **_: Any) -> list[float]:
+    return [sum(c in "abcdefghijklm" for c in text) / 4 for text in completions]
+
+
+def vowels(completions: list[str], **_: Any) -> list[float]:
+    return [sum(c in "aeiou" for c in text) / 4 for text in completions]
+
+
+GIVEN = {"prompts": PROMPTS, "reward": letters, "gold": vowels}
+
+
+@pytest.fixture(scope="module")
+def values(tmp_path_factory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("model")
+    texts = folder / "texts.txt"
+    texts.write_text("abc.\ndef.\nghi.\n")
+    return {**SMALL, "model": saved(folder / "llama", tiny_llama(2)), "ptx_data": str(texts)}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, values) -> Any:
+    return align(run_dir=tmp_path_factory.mktemp("whole") / "run", **GIVEN, **values)
+
+
+def rows_of(run: Path, name: str) -> list[dict]:
+    rows = [json.loads(line) for line in (run / name).read_text().splitlines()]
+    return [{k: v for k, v in row.items() if k != "seconds" and not k.startswith("time/")} for row in rows]
+
+
+def state_of(run: Path) -> tuple[Any, dict]:
+    _, tensors, state = Run.open(run).newest()
+    state["newest"] = {k: v for k, v in state["newest"].items() if not k.startswith("time/")}
+    return tensors, {**state, "seconds": 0, "records": None}
+
+
+def assert_same_end(a: Path, b: Path) -> None:
+    """Weights, critic, optimiser, generators, KL controller, monitor, metrics, and every sampled token."""
+    (tensors, state), (others, other) = state_of(a), state_of(b)
+    assert state == other
+    assert all(torch.equal(x, others[g][k]) for g, group in tensors.items() for k, x in group.items())
+    assert rows_of(a, "metrics.jsonl") == rows_of(b, "metrics.jsonl")
+    assert rows_of(a, "samples.jsonl") == rows_of(b, "samples.jsonl")
+    final, same = (json.loads((x / "summary.json").read_text())["final"] for x in (a, b))
+    assert final == same and final
+
+
+def killed(run: Path, values: dict, patch: Any, place: Any, name: str, call: int) -> None:
+    real, count = getattr(place, name), 0
+
+    def dying(*arguments: Any, **keywords: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count == call:
+            raise Killed
+        return real(*arguments, **keywords)
+
+    with patch.context() as inner, pytest.raises(Killed):
+        inner.setattr(place, name, dying)
+        if (run / "settings.json").exists():
+            resume_align(run, **GIVEN)
+        else:
+            align(run_dir=run, **GIVEN, **values)
+
+
+PHASES = {
+    "first sampling": (trainer, "gather", 1),
+    "scores": (trainer, "rewards_of", 4),
+    "update": (trainer.ppo, "check_first_ratios", 5),
+    "row": (Run, "record", 3),
+    "samples": (Run, "record_samples", 5),
+    "save": ("tightrope.runs.checkpoint", "write_file", 4),
+    "model": (trainer, "save_model", 1),
+}
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_every_phase_can_be_the_last(tmp_path, monkeypatch, values, whole, phase):
+    place, name, call = PHASES[phase]
+    killed(tmp_path, values, monkeypatch, checkpoint if isinstance(place, str) else place, name, call)
+    resume_align(tmp_path, **GIVEN)
+    assert_same_end(whole.path, tmp_path)
+
+
+def test_five_hops_end_where_none_does(tmp_path, monkeypatch, values, whole):
+    draw = random.Random(2)
+    for _ in range(5):
+        killed(tmp_path, values, monkeypatch, Trainer, "_one_iteration", draw.choice([1, 2, 2]))
+    resume_align(tmp_path, **GIVEN)
+    assert_same_end(whole.path, tmp_path)
+
+
+def test_a_run_that_its_budget_stopped_stays_stopped(tmp_path, monkeypatch, values):
+    tight = {**values, "kl_budget": 1e-6}
+    stopped = align(run_dir=tmp_path / "whole", **GIVEN, **tight)
+    assert stopped.summary["stopped_early"] and stopped.summary["episodes"] < 56
+    killed(tmp_path / "run", tight, monkeypatch, trainer, "save_model", 1)
+    resume_align(tmp_path / "run", **GIVEN)
+    assert_same_end(tmp_path / "whole", tmp_path / "run")
+
+
+def test_the_command_names_the_judge_again(tmp_path, monkeypatch, values, capsys):
+    """Stopped by SIGTERM: 143, the newest checkpoint, what is repeated, and a command that works."""
+    judge, prompts, run = tmp_path / "judge.py", tmp_path / "prompts.txt", tmp_path / "run"
+    judge.write_text("def score(completions, **_):\n    return [float(len(c)) for c in completions]\n")
+    prompts.write_text("\n".join(PROMPTS))
+    words = ["--model", values["model"], "--data", str(prompts), "--reward", f"{judge}:score"]
+    words += ["--run-dir", str(run), "--total-episodes", "32", "--batch-size", "8", "--minibatch-size", "8"]
+    words += ["--max-new-tokens", "4", "--lora-rank", "2", "--checkpoint-every", "0.5", "--threads", "1"]
+    real = Trainer._one_iteration
+
+    def stop(self: Trainer, *arguments: Any) -> Any:
+        if self.iteration == 3:
+            raise signals.Stopped(15)
+        return real(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_one_iteration", stop)
+        assert main(["align", *words]) == 143
+    said = capsys.readouterr().err
+    assert "Stopped by SIGTERM at response 24. The newest valid checkpoint is " in said
+    assert "step-000000000016; 8 responses since then will be repeated." in said
+    assert f"\n  tightrope resume {run} --reward {judge}:score\n" in said
+    assert main(["resume", str(run), "--reward", f"{judge}:score", "--quiet"]) == 0
