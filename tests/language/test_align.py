@@ -12,6 +12,7 @@ from tightrope.algorithms import ppo
 from tightrope.cli import main
 from tightrope.language import align
 from tightrope.language.align import resume_align
+from tightrope.language.settings import AlignSettings
 from tightrope.language.trunk import Trunk
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
@@ -239,6 +240,11 @@ def test_a_kl_budget_stops_the_run(folder, tmp_path):
     run = align(model=folder, prompts=PROMPTS, reward=letters, run_dir=tmp_path / "run", **values)
     assert run.summary["stopped_early"] and run.summary["episodes"] < 640
     assert run.metrics[-1]["objective/kl"] >= 0.5 > run.metrics[-2]["objective/kl"]
+    assert "train/grad_norm" in run.metrics[-2] and "train/grad_norm" not in run.metrics[-1]
+
+
+def test_no_critic_is_said_as_in_python():
+    assert AlignSettings(critic=None, samples_per_prompt=2).critic == "none"
 
 
 def test_the_commands(folder, tmp_path, capsys):

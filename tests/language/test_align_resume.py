@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from language.tiny import saved, tiny_llama
 from tightrope.cli import main
 from tightrope.language import trainer
 from tightrope.language.align import align, resume_align
+from tightrope.language.evaluate import sample_run
 from tightrope.language.trainer import Trainer
 from tightrope.runs import checkpoint, signals
 from tightrope.runs.run import Run
@@ -153,3 +155,39 @@ def test_the_command_names_the_judge_again(tmp_path, monkeypatch, values, capsys
     assert "step-000000000016; 8 responses since then will be repeated." in said
     assert f"\n  tightrope resume {run} --reward {judge}:score\n" in said
     assert main(["resume", str(run), "--reward", f"{judge}:score", "--quiet"]) == 0
+
+
+def test_a_function_is_asked_for_again_whatever_its_name(tmp_path, values, monkeypatch):
+    """Neither a reward that this package knows nor a folder that lies about is taken for it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rewards").mkdir()
+    for name in ("length", "rewards"):
+
+        def own(completions: list[str], **_: Any) -> list[float]:
+            return [-1.0] * len(completions)
+
+        own.__name__ = name
+        given = {**GIVEN, "reward": own}
+        align(run_dir=tmp_path / name / "run", **given, **{**values, "total_episodes": 8})
+        with pytest.raises(ValueError, match=f"The reward of .* was '<{name}>': code"):
+            resume_align(tmp_path / name / "run", **{**given, "reward": None}, total_episodes=16)
+
+
+def test_other_prompts_and_less_than_was_done_are_refused(tmp_path, values, whole):
+    run = tmp_path / "run"
+    shutil.copytree(whole.path, run)
+    before = (run / "summary.json").read_bytes(), (run / "settings.json").read_bytes()
+    with pytest.raises(ValueError, match="other prompts than these"):
+        resume_align(run, **{**GIVEN, "prompts": [*PROMPTS[:-1], "q"]}, total_episodes=64)
+    with pytest.raises(ValueError, match="has had 56 responses already"):
+        resume_align(run, **GIVEN, total_episodes=24)
+    assert ((run / "summary.json").read_bytes(), (run / "settings.json").read_bytes()) == before
+    told = []
+    again = resume_align(run, **GIVEN, report=lambda event, data: told.append(data.get("text", "")))
+    assert any("--total-episodes N goes on" in text for text in told)
+    assert again.summary["final"] == whole.summary["final"] and again.summary["wall_seconds"] > 0
+
+
+def test_a_negative_seed_of_sampling_is_refused(whole):
+    with pytest.raises(ValueError, match="seed is -1, expected 0 or more"):
+        sample_run(whole.path, seed=-1)

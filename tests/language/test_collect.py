@@ -12,7 +12,7 @@ import torch
 from language.test_roles import PROMPTS, fresh, settings, shake
 from language.tiny import saved, tiny_llama
 
-from tightrope.language.collect import describe, gather, kl_share, rewards_of, to_batch
+from tightrope.language.collect import comparable, describe, gather, kl_share, rewards_of, to_batch
 from tightrope.language.rewards import Scores
 from tightrope.language.trainer import PolicyModel
 
@@ -259,3 +259,9 @@ def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(fol
     trained = (now - batch.old_logp)[batch.mask].abs().max()
     sampled = (now - experience.responses.logp)[batch.mask].abs().max()
     assert trained < 1e-3 < 1e-2 < sampled
+
+
+def test_a_response_without_a_sibling_that_counts_is_compared_with_nobody():
+    valid = np.array([True, False, False, True, True, True, True, False, False])
+    assert comparable(valid, 3).tolist() == [False] * 3 + [True] * 3 + [False] * 3
+    assert comparable(np.array([True, True, False]), 3).tolist() == [True, True, False]

@@ -238,6 +238,11 @@ def test_an_opening_is_written_once(template):
     assert made.decode(list(prompt.tokens)) == "<bos>abc"
 
 
+def test_a_completion_of_white_space_is_one():
+    (example,) = examples([{"prompt": "ask.", "completion": "\n"}])
+    assert sum(example.learn) == 2  # it and the EOS
+
+
 def test_no_token_reaches_across_from_prompt_to_completion():
     from tokenizers import Tokenizer, models
     from transformers import PreTrainedTokenizerFast
@@ -294,6 +299,7 @@ BAD_CHAT = [{"role": "user", "content": "a"}, {"role": "assistant", "content": "
     [
         ({"text": "  "}, r"text of data\[1\] is empty"),
         ({"prompt": "", "completion": "a"}, r"prompt of data\[1\] is empty"),
+        ({"prompt": " ", "completion": "a"}, r"prompt of data\[1\] is empty"),
         ({"prompt": "a", "completion": ""}, r"completion of data\[1\] is empty"),
         ({"messages": []}, r"messages of data\[1\] is empty"),
         ({"messages": BAD_CHAT}, r"data\[1\] has an empty assistant message"),

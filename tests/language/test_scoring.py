@@ -1,6 +1,7 @@
 """Who judges: functions and a reward model together; no column is lost and no score is made up."""
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,12 +9,15 @@ import numpy as np
 import pytest
 import torch
 from language.test_collect import experienced
+from language.test_reward_model import preferences
 from language.test_roles import PROMPTS, settings
 from language.tiny import saved, tiny_llama, tokenizer
 
 from tightrope.language.answers import RewardError
+from tightrope.language.reward_model import train_reward
 from tightrope.language.rewards import Rewards
-from tightrope.language.scoring import Judge, make_judge
+from tightrope.language.scoring import Judge, make_judge, shares_trunk
+from tightrope.language.settings import RewardSettings
 
 ASKED = [prompt for prompt in PROMPTS for _ in range(2)]
 
@@ -132,3 +136,16 @@ def test_what_cannot_judge_is_named(sampled, tmp_path):
             make_judge(reward, roles, on_trunk=None, timeout=None)
     config = json.loads((Path(good) / "config.json").read_text())
     assert config["architectures"] == ["LlamaForSequenceClassification"]
+
+
+def test_an_adapter_shares_the_trunk_of_its_own_weights_wherever_they_lie(tmp_path):
+    first = tmp_path / "model"
+    saved(first, tiny_llama(2))
+    given = RewardSettings(model=str(first), minibatch_size=4, max_tokens=16, held_out=0.0)
+    train_reward(given, data=preferences(8), run_dir=tmp_path / "reward")
+    adapter = tmp_path / "reward" / "adapter"
+    assert shares_trunk(adapter, str(first))
+    shutil.copytree(first, tmp_path / "copy")
+    assert shares_trunk(adapter, str(tmp_path / "copy"))
+    saved(first, tiny_llama(2, seed=1))  # the same place, other weights
+    assert not shares_trunk(adapter, str(first))

@@ -1,5 +1,7 @@
 """The loop of an alignment run: every part gets what is meant for it, nothing twice and nothing stale."""
 
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from tightrope.language.fitting import silent
 from tightrope.language.kl import KL_FORMS, AdaptiveKL
 from tightrope.language.reward_model import train_reward
 from tightrope.language.settings import AlignSettings, RewardSettings
-from tightrope.language.trainer import Grid, Trainer, hold_out
+from tightrope.language.trainer import Trainer, hold_out
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
 
@@ -124,12 +126,6 @@ def test_held_out_prompts_are_never_trained_on_not_even_twins():
         hold_out(prompts[:3] * 4, 1)
 
 
-def test_a_grid_is_met_once_a_point():
-    grid = Grid(0.25, from_start=False)
-    assert [grid.due(k / 10) for k in range(11)] == [k in (3, 5, 8, 10) for k in range(11)]
-    assert Grid(0.5, from_start=True).due(0.0) and not Grid(None, from_start=True).due(1.0)
-
-
 def test_the_settings_of_the_update_reach_the_update(folder, monkeypatch):
     values = {
         "dual_clip": 3.0, "clip": 0.1, "clip_high": 0.3, "value_clip": 0.4, "value_weight": 0.7,
@@ -162,10 +158,11 @@ def test_a_critic_made_of_the_reward_model_begins_with_its_scores(folder, tmp_pa
         with pytest.raises(ValueError, match="critic separate"):
             trainer(folder, reward, critic=critic, critic_from_reward=True)
         return
-    made = trainer(folder, reward, critic=critic, critic_from_reward=True)
+    shaped = {"critic_from_reward": True, "reward_scale": 3.0}
+    made = trainer(folder, (reward, -0.5), critic=critic, **shaped)
     experience = gather(made.roles, made.prompts, 1, 0, 1)
     scores = made.judge(made.prompts, experience)
-    np.testing.assert_allclose(experience.final_values.numpy(), scores.total, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(experience.final_values.numpy(), 3.0 * scores.total, rtol=1e-3, atol=1e-3)
     assert scores.total.std() > 0.01
 
 
@@ -174,3 +171,29 @@ def test_a_head_on_the_policy_cannot_be_made_of_a_reward_model(folder, tmp_path)
         trainer(folder, critic="head", critic_from_reward=True)
     with pytest.raises(ValueError, match="expected the folder of a reward model"):
         trainer(folder, letters, critic="separate", critic_from_reward=True)
+
+
+def test_held_out_prompts_are_answered_as_many_at_a_time_as_a_batch_has(folder, monkeypatch):
+    """The memory ledger counts on it."""
+    from tightrope.language import trainer as module
+
+    sizes, real = [], module.gather
+    monkeypatch.setattr(module, "gather", lambda roles, prompts, *more: (
+        sizes.append(len(prompts)), real(roles, prompts, *more))[1])  # fmt: skip
+    settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, held_out_prompts=10)
+    made = Trainer(settings, [chr(97 + k % 26) * (1 + k // 26) for k in range(44)], letters, letters, silent)
+    score = made.evaluate()
+    assert sizes == [4, 4, 2] and len(made.held_out) == 10 and 0 <= score <= 1
+
+
+def test_the_clock_of_a_run_leaves_evaluations_out(folder):
+    def slow(completions, **_):
+        time.sleep(0.3)
+        return [0.0] * len(completions)
+
+    settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, total_episodes=8)
+    made = Trainer(settings, list("abcdefgh"), letters, slow, silent)
+    begin = time.perf_counter()
+    metrics, _ = next(made.iterate())
+    assert "eval/gold" in metrics and metrics["time/seconds"] <= time.perf_counter() - begin - 0.3
+    assert metrics["time/update_seconds"] < metrics["time/seconds"]

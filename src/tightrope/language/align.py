@@ -62,14 +62,16 @@ def align(
 
 
 def _named(prompts: Any, reward: Any, gold: Any) -> dict[str, str]:
-    """What settings.json says of objects that were given in Python: their names, for display."""
+    """What settings.json says of objects that were given in Python: their names in angle brackets, for
+    display alone, so that none is taken for a file, a folder or a reward that this package knows.
+    """
     found = {}
     for name, value in (("data", prompts), ("reward", reward), ("gold", gold)):
         if value is not None:
             found[name] = (
                 str(value)
                 if isinstance(value, str | Path)
-                else getattr(value, "__name__", f"<{type(value).__name__}>")
+                else f"<{getattr(value, '__name__', type(value).__name__).strip('<>')}>"
             )
     return found
 
@@ -117,6 +119,14 @@ def resume_align(
         point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
         if point is not None:
             restore_state(trainer, point)
+        if total_episodes is not None and total_episodes < trainer.episodes:
+            raise ValueError(
+                f"{run_dir} has had {trainer.episodes:,} responses already; expected total_episodes of as "
+                f"many or more, got {total_episodes:,}."
+            )
+        if point is not None and trainer.episodes >= settings.total_episodes:
+            text = f"{run_dir} has its {trainer.episodes:,} responses; --total-episodes N goes on from there."
+            report("line", {"text": text})
         trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
         run.rewind(point)
         run.update_settings(dataclasses.asdict(settings))

@@ -211,6 +211,14 @@ def length_lambda(lengths: Tensor, alpha: float) -> Tensor:
     return (1.0 - 1.0 / (alpha * lengths.float())).clamp(min=0.0)
 
 
+def comparable(valid: np.ndarray, samples: int) -> np.ndarray:
+    """Of responses whose score counts [B], those that another response to the same prompt, whose score counts
+    too, can be compared with.
+    """
+    together = valid.reshape(-1, samples)
+    return (together & (together.sum(1, keepdims=True) > 1)).reshape(-1)
+
+
 def leave_one_out(rewards: Tensor, mask: Tensor, valid: Tensor, samples: int, gamma: float = 1.0) -> Tensor:
     """Advantages without a critic: reward to go minus the mean return of the prompt's *other* responses.
 

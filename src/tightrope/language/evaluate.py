@@ -29,6 +29,8 @@ def sample_run(
     """
     path = Path(path)
     settings = Run.open(path).settings
+    if seed is not None and seed < 0:
+        raise ValueError(f"seed is {seed}, expected 0 or more.")
     if not (path / "model" / "config.json").is_file():
         raise ValueError(
             f"{path} holds no aligned model: the run has not come to its end, or is none of align."

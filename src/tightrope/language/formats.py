@@ -197,7 +197,7 @@ def content(row: dict[str, Any], column: str, place: str) -> str | Messages:
     if not isinstance(value, str | list):
         kind = type(value).__name__
         raise ValueError(f"{column} of {place} is {kind}; expected a string or a list of messages.")
-    if not value or (isinstance(value, str) and not value.strip()):
+    if not value or (column != "completion" and isinstance(value, str) and not value.strip()):
         raise ValueError(f"{column} of {place} is empty. Take the row out, or fill it in.")
     if isinstance(value, str):
         return encodable(value, f"{column} of {place}")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tightrope.language.data import Example, pad_right, read_rows, sft_examples
+from tightrope.language.data import Example, Notify, pad_right, read_rows, sft_examples
 from tightrope.language.roles import Roles
 from tightrope.language.settings import AlignSettings
 from tightrope.language.token_stats import Sampling, token_statistics
@@ -22,12 +22,14 @@ class Pretraining:
         self.rng = np.random.default_rng([seed, 11])
 
     @classmethod
-    def make(cls, settings: AlignSettings, roles: Roles) -> Pretraining:
-        """From the settings' ptx_data, each text cut to the tokens of a prompt and a response."""
+    def make(cls, settings: AlignSettings, roles: Roles, notify: Notify) -> Pretraining:
+        """From the settings' ptx_data, each text cut to the tokens of a prompt and a response; ``notify`` is
+        told how many were.
+        """
         longest = settings.max_prompt_tokens + settings.max_new_tokens
         rows = read_rows(settings.ptx_data)
         examples = sft_examples(
-            rows, roles.tokenizer, eos=roles.eos, max_tokens=longest, on_completions=False
+            rows, roles.tokenizer, eos=roles.eos, max_tokens=longest, on_completions=False, notify=notify
         )
         return cls(roles, examples, settings.ptx_per_response, settings.seed)
 

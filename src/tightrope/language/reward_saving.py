@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from tightrope.language import lora
 from tightrope.language.fitting import Loaded
+from tightrope.language.models import fingerprint
 from tightrope.runs.durable import whole
 
 SHIFT = "tightrope_reward_shift"  # in config.json: score = what the head says - shift
@@ -73,7 +74,8 @@ def _save_adapter(folder: Path, head: Tensor, shift: float, loaded: Loaded) -> N
     config["modules_to_save"] = ["score"]
     (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
     shifted = {"score.weight": score.clone(), "shift": torch.tensor(shift, dtype=torch.float64)}
-    save_file(shifted, folder / "head.safetensors")
+    trunk = fingerprint(loaded.source)
+    save_file(shifted, folder / "head.safetensors", metadata={"trunk": trunk} if trunk else None)
 
 
 def card(shift: float, source: str, final: dict[str, float]) -> str:

@@ -5,6 +5,7 @@ which the run goes on.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from torch import Tensor, nn
 
 from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
 from tightrope.language import lora
+from tightrope.language.data import Prompt
 from tightrope.language.models import find_model
 from tightrope.language.roles import Roles
 from tightrope.language.settings import AlignSettings
@@ -65,6 +67,13 @@ def put_back(tensors: Tensors, parameters: Sequence[nn.Parameter], optimiser: to
     restore_optimiser(optimiser, tensors["optimiser"])
 
 
+def _hash_of(prompts: Sequence[Prompt]) -> str:
+    digest = hashlib.sha256()
+    for prompt in prompts:
+        digest.update(repr(prompt.tokens).encode())
+    return digest.hexdigest()
+
+
 def save_state(trainer: Trainer, run: Run, *, final: bool = False) -> None:
     """A checkpoint at the present episode; see `Run.save`. The best one has the highest gold score."""
     tensors = tensors_of(trainer.roles.parameters(), trainer.optimiser)
@@ -74,6 +83,7 @@ def save_state(trainer: Trainer, run: Run, *, final: bool = False) -> None:
         "iteration": trainer.iteration,
         "kl_beta": trainer.kl_beta,
         "prompt_position": trainer.order.position,
+        "prompts_sha256": _hash_of([*trainer.prompts, *trainer.held_out]),
         "rng": {"update": trainer.update_rng.bit_generator.state},
         "monitor": trainer.monitor.state(),
         "stopped": trainer.stopped,
@@ -92,6 +102,11 @@ def restore_state(trainer: Trainer, point: Checkpoint) -> None:
     folder, tensors, state = point
     if state.get("story") != "align":
         raise ValueError(f"{folder} is no checkpoint of an alignment run.")
+    if state["prompts_sha256"] != _hash_of([*trainer.prompts, *trainer.held_out]):
+        raise ValueError(
+            f"{folder} is of a run with other prompts than these {len(trainer.prompts):,}. Give those that "
+            "the run began with, or begin a new run."
+        )
     put_back(tensors, trainer.roles.parameters(), trainer.optimiser)
     trainer.episodes, trainer.iteration = int(state["episodes"]), int(state["iteration"])
     trainer.kl_beta = float(state["kl_beta"])

@@ -16,6 +16,7 @@ from tightrope.language import lora
 from tightrope.language.answers import Fault, RewardError
 from tightrope.language.collect import Experience
 from tightrope.language.data import Prompt
+from tightrope.language.models import fingerprint
 from tightrope.language.reward_model import RewardModel, last_real, load_reward
 from tightrope.language.rewards import Rewards, Scores, checked_weight, load_reward_function, unlike
 from tightrope.language.roles import Roles
@@ -132,13 +133,12 @@ def reward_adapter(words: Any) -> Path | None:
 
 
 def shares_trunk(adapter: Path, model: str) -> bool:
-    """Whether a reward adapter was trained on the very model that is aligned."""
-    import json
+    """Whether a reward adapter was trained on the very weights that are aligned, wherever they lie."""
+    from safetensors import safe_open
 
-    named = json.loads((adapter / "adapter_config.json").read_text(encoding="utf-8"))[
-        "base_model_name_or_path"
-    ]
-    return bool(named) and Path(named).resolve() == Path(model).resolve()
+    with safe_open(adapter / "head.safetensors", "pt") as file:
+        trained = (file.metadata() or {}).get("trunk")
+    return bool(trained) and trained == fingerprint(model)
 
 
 def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: float | None) -> Judge:
@@ -198,7 +198,7 @@ def _same_tokens(model: RewardModel, roles: Roles, folder: Any) -> None:
 
 
 def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
-    """Begin the critic with a reward model's weights: V = score at first.
+    """Begin the critic with a reward model's weights: V = what its score adds to the reward at first.
 
     An adapter takes the reward model's adapter, a critic of its own the whole reward model; a head on the
     policy's hidden states cannot read what the reward model's hidden states say. ValueError for what does not
@@ -227,9 +227,10 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
                 f"critic_from_reward: the reward model {folder} is built otherwise than the critic, which is "
                 f"made of {roles.settings.model} ({str(error).splitlines()[-1].strip()}). Leave it out."
             ) from error
+    scale = judge.weight * roles.settings.reward_scale
     with torch.no_grad():
-        head.weight.copy_(weight)
-        head.bias.fill_(-shift)
+        head.weight.copy_(weight * scale)
+        head.bias.fill_(-shift * scale)
 
 
 def _entries(reward: Any) -> list[Any]:

@@ -181,6 +181,8 @@ class AlignSettings(ModelSettings):
 
     def __post_init__(self) -> None:
         """Check ranges, and the settings that must fit each other."""
+        if self.critic is None:  # as in Python: no critic
+            object.__setattr__(self, "critic", "none")
         check_ranges(self)
         if not isinstance(self.update, RLHFSettings):
             raise ValueError(f"update is {type(self.update).__name__}; expected RLHFSettings.")

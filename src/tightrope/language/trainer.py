@@ -17,7 +17,15 @@ from torch import Tensor
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.algorithms.optimise import SamplingMismatch, make_optimiser, set_learning_rates
-from tightrope.language.collect import PromptOrder, describe, gather, kl_share, rewards_of, to_batch
+from tightrope.language.collect import (
+    PromptOrder,
+    comparable,
+    describe,
+    gather,
+    kl_share,
+    rewards_of,
+    to_batch,
+)
 from tightrope.language.data import Prompt, read_prompts, read_rows
 from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
@@ -94,7 +102,7 @@ class Trainer:
         self.order = PromptOrder(len(self.prompts), settings.seed)
         self.update_rng = np.random.default_rng([settings.seed, 9])
         self.kl_beta = settings.kl_beta
-        self.pretraining = Pretraining.make(settings, self.roles) if settings.ptx_weight else None
+        self.pretraining = Pretraining.make(settings, self.roles, self._warn) if settings.ptx_weight else None
         self.monitor = Monitor(kl_budget=settings.kl_budget)
         self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
         self.seconds, self.newest = 0.0, dict[str, float]()
@@ -120,15 +128,13 @@ class Trainer:
 
     def run(self, run: Run) -> Aligned:
         """Train until the budget is spent; the run folder then holds everything."""
-        settings, begin = self.settings, time.perf_counter() - self.seconds
+        settings = self.settings
         total = {"total_steps": settings.total_episodes}
         facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self._lines()}
         self.report("start", {"settings": dataclasses.asdict(settings), **facts, **total})
         with run, signals.stoppable():
             for metrics, rows in self.iterate():
                 signals.check()
-                metrics["time/seconds"] = self.seconds = time.perf_counter() - begin
-                self._watch(metrics)
                 self.newest = metrics
                 run.record(self.episodes, metrics["time/seconds"], metrics)
                 run.record_samples(rows)
@@ -161,7 +167,7 @@ class Trainer:
         return crosses(max(0, before), self.episodes, self.settings.total_episodes, fraction)
 
     def _watch(self, metrics: dict[str, float]) -> None:
-        """Over-optimisation: warn, and stop at the KL budget."""
+        """Over-optimisation: warn, and stop at the KL budget before another step is taken."""
         seen = (metrics["objective/kl"], metrics["objective/scores"], metrics.get("eval/gold"))
         for alarm in self.monitor.add(*seen):
             self._warn(alarm.text)
@@ -210,6 +216,8 @@ class Trainer:
         scores = self.judge(asked, experience, self._trainer_state())
         scored = time.perf_counter()
         self._tell_faults(scores)
+        if settings.critic == "none":
+            scores.valid[:] = comparable(scores.valid, settings.samples_per_prompt)
         rewards, self.reward_scale = rewards_of(experience, scores, settings, self.kl_beta)
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
         batch = to_batch(experience, rewards, valid, settings)
@@ -218,7 +226,9 @@ class Trainer:
         self._check_sampling(metrics["objective/sampling_gap"])
         if self.gold is not None and (not self.episodes or self._reached(settings.evaluate_every)):
             metrics["eval/gold"] = self.evaluate()  # of the policy whose KL this rollout tells
-        if len(batch):
+        self._watch(metrics)
+        judged = time.perf_counter()
+        if len(batch) and not self.stopped:
             metrics |= self._update(batch, present)
             if settings.critic != "none":
                 metrics["train/explained_variance"] = float(
@@ -227,13 +237,16 @@ class Trainer:
         metrics["objective/kl_beta"] = self.kl_beta
         metrics["train/learning_rate"] = present.learning_rate
         metrics["time/score_seconds"] = scored - gathered
-        metrics["time/update_seconds"] = time.perf_counter() - scored
+        metrics["time/update_seconds"] = time.perf_counter() - judged
         if settings.kl_goal is not None and len(batch):
             controller = AdaptiveKL(self.kl_beta, settings.kl_goal, settings.kl_horizon)
             self.kl_beta = controller.next(metrics["objective/kl"], len(asked)).kl_beta
         self.episodes += len(asked)
         self.iteration += 1
-        metrics["time/fps"] = float(experience.responses.mask.sum()) / (time.perf_counter() - begin)
+        seconds = metrics["time/update_seconds"] + scored - begin
+        self.seconds += seconds
+        metrics["time/seconds"] = self.seconds
+        metrics["time/fps"] = float(experience.responses.mask.sum()) / seconds
         return metrics, sample_rows(
             self.roles.tokenizer, asked, experience, scores, batch, valid, self.episodes
         )
@@ -304,11 +317,15 @@ class Trainer:
         )
 
     def evaluate(self) -> float:
-        """The mean gold score of responses to held-out prompts, sampled as in training."""
+        """The mean gold score of responses to held-out prompts, sampled as in training, as many at a time."""
         assert self.gold is not None
-        experience = gather(self.roles, self.held_out, self.settings.seed + 1_000_003, 0, 1)
-        scores = self.gold(self.held_out, experience, self._trainer_state())
-        return float(scores.total[scores.valid].mean()) if scores.valid.any() else float("nan")
+        size, seed, found = self.settings.batch_size, self.settings.seed + 1_000_003, list[np.ndarray]()
+        for number, start in enumerate(range(0, len(self.held_out), size)):
+            prompts = self.held_out[start : start + size]
+            scores = self.gold(prompts, gather(self.roles, prompts, seed, number, 1), self._trainer_state())
+            found.append(scores.total[scores.valid])
+        judged = np.concatenate(found)
+        return float(judged.mean()) if len(judged) else float("nan")
 
 
 def hold_out(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prompt]]:

@@ -128,10 +128,13 @@ LANGUAGE_TABLE = (
         "time/score_seconds",
         "s",
         "down",
-        "Seconds of this update that rewards, reference and critic took on the finished responses.",
+        "Seconds of this update that rewards took on the finished responses.",
     ),
     metric(
-        "time/tokens_per_second", "tokens/s", "up", "Response tokens of this update over all its seconds."
+        "time/tokens_per_second",
+        "tokens/s",
+        "up",
+        "Response tokens of this update over the seconds of sampling them.",
     ),
     metric("sft/loss", "nats/token", "down", "-logp of the tokens to be learnt, mean over the minibatch."),
     metric("sft/held_out_loss", "nats/token", "down", "The same on examples that are not trained on."),
