@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.control.agent import AGENTS, Agent
-from tightrope.control.environments import Environments
-from tightrope.control.evaluate import evaluate_agent, evaluation_environments
+from tightrope.control.evaluate import EVALUATION_SEED, evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
 from tightrope.control.saving import rebuild, restore, resume_episodes, save_agent, snapshot
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
@@ -168,25 +167,25 @@ class _Evaluator:
 
     def __init__(self, agent: Agent, run: Run, report: Reporter, best: float) -> None:
         self.agent, self.run, self.report, self.best = agent, run, report, best
-        self.environments = None
+        self.environments, self.first_state = None, None
         if agent.settings.evaluate_every is None:
             return
         try:
-            self.environments = self._made()
+            episodes = agent.settings.evaluation_episodes
+            self.environments = evaluation_environments(agent.env, agent.settings, episodes)
         except ValueError as error:
             report("line", {"text": f"no evaluation while training: {error}"})
-
-    def _made(self) -> Environments:
-        settings = self.agent.settings
-        return evaluation_environments(self.agent.env, settings, settings.evaluation_episodes)
+            return
+        if self.environments.gives_state:
+            # what a copy keeps from one evaluation to the next must not change what a resumed run sees
+            self.environments.reset(EVALUATION_SEED)
+            self.first_state = self.environments.get_state()
 
     def evaluate(self) -> dict[str, float]:
         if self.environments is None:
             return {}
-        if self.environments.gives_state:
-            # they may remember earlier evaluations, of which a run that was gone on with knows nothing
-            self.environments.close()
-            self.environments = self._made()
+        if self.first_state is not None:
+            self.environments.set_state(self.first_state)
         result = evaluate_agent(self.agent, self.environments, self.agent.settings.evaluation_episodes)
         metrics = {
             "eval/mean_reward": result["mean_return"],
