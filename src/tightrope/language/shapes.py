@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.models import Parts, parts
+from tightrope.language.models import Parts, fused, parts
 
 LENGTHS = (16, 32, 48)  # tokens at which a forward pass is measured, evenly spaced
 
@@ -51,7 +51,7 @@ def shapes_of(config: Any, dtype: str) -> Shapes:
     kind = getattr(torch, dtype)
     with torch.device("meta"):
         config = copy.deepcopy(config)  # transformers writes into it
-        model = AutoModelForCausalLM.from_config(config, dtype=kind, attn_implementation="sdpa").eval()
+        model = fused(AutoModelForCausalLM.from_config, config, dtype=kind).eval()
     found = parts(model)
     linears = [_linears(layer) for layer in found.layers]
     inner = config.get_text_config()
@@ -80,7 +80,8 @@ def _saved_per_token(found: Parts, linears: list[list[tuple[int, int]]], item: i
     """Bytes per token that the base keeps for a backward pass through all of its weights."""
     try:
         first, second, third = (saved_bytes(found.base, length) for length in LENGTHS)
-    except (RuntimeError, NotImplementedError):  # layers that must look at numbers, as routed experts do
+    except (RuntimeError, NotImplementedError, ValueError, TypeError, AttributeError, IndexError):
+        # layers that must look at numbers, as routed experts do, or a base that takes no mask of four axes
         widest = max(side for layer in linears for pair in layer for side in pair)
         return len(linears) * (12 * found.head.weight.shape[1] + 4 * widest) * item
     step = LENGTHS[1] - LENGTHS[0]

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from tightrope.language.heads import at_head
+
 CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 
 
@@ -81,7 +83,7 @@ def token_statistics(
         head.weight,
         head.bias,
         tokens,
-        sampling,
+        at_head(sampling, head),
         support,
         reference,
         other.weight,
