@@ -18,11 +18,10 @@ from tightrope.language.rewards import Scores
 from tightrope.language.roles import Roles, make_roles
 from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.language.trainer import LOG_RATIO_LIMIT
+from tightrope.language.trainer import log_ratio_limit
 from tightrope.runs.findings import Finding
 
 WORDS = ("The", "Once upon a time there was", "I think that", "a b c d e f g h")
-LOWERED_LIMIT = 0.5  # nats, bfloat16: two passes round otherwise; a wrong mask or position costs several
 GRADIENT_LIMIT = 1e-3  # relative, of the norm: float32 sums in another order
 
 
@@ -39,6 +38,7 @@ def check_model(model: str, dtype: str = "float32") -> list[Finding]:
     rewards, _ = rewards_of(experience, scores, settings, settings.kl_beta)
     batch = to_batch(experience, rewards, torch.ones(8, dtype=torch.bool), settings)
     return [
+        _same_logits(roles, experience),
         _same_policy(roles, experience),
         _reference(experience),
         _first_ratios(roles, batch),
@@ -53,8 +53,25 @@ def check_model(model: str, dtype: str = "float32") -> list[Finding]:
 
 
 def _limit(roles: Roles) -> float:
-    """The largest gap of two passes over one token that is rounding, in nats."""
-    return LOG_RATIO_LIMIT if roles.settings.dtype == "float32" else LOWERED_LIMIT
+    return log_ratio_limit(roles.settings.dtype)
+
+
+@torch.no_grad()
+def _same_logits(roles: Roles, experience: Experience) -> Finding:
+    """The bare trunk and its head beside what the model itself says, unpadded rows one at a time."""
+    worst, head = 0.0, roles.trunk.parts.head
+    for row, real in zip(experience.tokens, experience.real, strict=True):
+        tokens = row[real][None]
+        hidden = roles.reference_hidden(tokens, torch.ones_like(tokens, dtype=torch.bool), None)[0, :-1]
+        ours = token_statistics(hidden, head, tokens[0, 1:], Sampling()).logp
+        logits = roles.model(input_ids=tokens, use_cache=False).logits[0, :-1].float()
+        theirs = logits.log_softmax(1).gather(1, tokens[0, 1:, None])[:, 0]
+        worst = max(worst, float((ours - theirs).abs().max()))
+    return Finding(
+        "log-probabilities are those of model(tokens).logits", worst <= _limit(roles),
+        f"largest gap {worst:.1e} nats a token",
+        "The model makes its logits otherwise than head(base(tokens)) times a factor. Report the model.",
+    )  # fmt: skip
 
 
 def _same_policy(roles: Roles, experience: Experience) -> Finding:

@@ -51,6 +51,12 @@ from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run
 
 LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
+LOWERED_LIMIT = 0.5  # nats, bfloat16: two passes round otherwise; a wrong mask or position costs several
+
+
+def log_ratio_limit(dtype: str) -> float:
+    """The largest gap of two passes over one token that is rounding, in nats."""
+    return LOG_RATIO_LIMIT if dtype == "float32" else LOWERED_LIMIT
 
 
 @dataclass(frozen=True)
@@ -258,7 +264,7 @@ class Trainer:
         if warming:
             batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
             present = present.unchecked(entropy_weight=0.0, target_kl=None)
-        limit = LOG_RATIO_LIMIT if self.settings.dtype == "float32" else None
+        limit = log_ratio_limit(self.settings.dtype)
         kl_weight = self.kl_beta * self.reward_scale  # a KL in the loss is scaled as the rewards were
         if present.normalise_advantages and not self.settings.kl.endswith("reward"):
             # one scale for the whole rollout, so that a KL in the loss keeps its price in units of the reward
@@ -293,11 +299,14 @@ class Trainer:
         return extra if not form.endswith("reward") or pretraining is not None else None
 
     def _check_sampling(self, gap: float) -> None:
-        if self.settings.dtype == "float32" and not gap <= LOG_RATIO_LIMIT:
+        limit = log_ratio_limit(self.settings.dtype)
+        if not gap <= limit:
             raise SamplingMismatch(
                 f"The log-probabilities of sampling and of the forward pass that trains differ by {gap:.3g} "
-                f"nats (limit {LOG_RATIO_LIMIT:g}). The model computes another distribution with its KV "
-                "cache than without: see tightrope doctor --model."
+                f"nats (limit {limit:g} in {self.settings.dtype}). Likely causes: the model says something "
+                "else with its KV cache than without, layers that look back over a window or were shared "
+                "wrongly, a module that draws random numbers, or too coarse a precision. See tightrope "
+                "doctor --model, and try --dtype float32, or lora_layers left out."
             )
 
     def _tell_faults(self, scores: Any) -> None:
