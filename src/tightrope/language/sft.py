@@ -27,13 +27,15 @@ from tightrope.language.fitting import (
     training_rows,
     warner,
 )
-from tightrope.language.models import parts
+from tightrope.language.models import attention_window, parts
 from tightrope.language.packing import Packed, attention_of, collate, pack, row_of
 from tightrope.language.saving import write_model
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised import announcement, finish, opened, recorded, reopened
 from tightrope.language.token_stats import Sampling, token_statistics
 from tightrope.runs.durable import whole
+
+PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
 
 
 def hidden_states(model: Any, rows: Packed) -> Tensor:
@@ -48,6 +50,32 @@ def hidden_states(model: Any, rows: Packed) -> Tensor:
     mask.masked_fill_(~allowed, torch.finfo(model.dtype).min)
     out = base(input_ids=rows.tokens, attention_mask=mask, position_ids=rows.positions, use_cache=False)
     return out.last_hidden_state
+
+
+@torch.no_grad()
+def require_packable(model: Any, longest: int) -> None:
+    """ValueError for a model whose loss would not be the same when texts share a row of ``longest`` tokens:
+    one whose attention looks back over a shorter window, or that reads attention masks in another way.
+    """
+    name, window = type(model).__name__, attention_window(model)
+    if window is not None and window < longest:
+        raise ValueError(
+            f"--pack with {name}, some layers of which look back over {window} tokens, and max_tokens "
+            f"{longest}: in packed rows they would look further. Leave --pack out, or choose --max-tokens "
+            f"{window} or less."
+        )
+    texts = [Example(tuple(range(size)), (False, *(True,) * (size - 1))) for size in (5, 4)]
+    apart = token_loss(model, collate([row_of([text]) for text in texts]).to(model.device))
+    gap, reason = float("inf"), ""
+    try:
+        gap = float((token_loss(model, row_of(texts).to(model.device)) / apart - 1).abs())
+    except (TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
+        reason = f" ({error})"
+    if gap > (PACKED_GAP if model.dtype == torch.float32 else 0.05):
+        raise ValueError(
+            f"--pack with {name}: two texts in one row give another loss than apart, relative gap {gap:.1e}"
+            f"{reason}. The model reads attention masks in another way. Leave --pack out."
+        )
 
 
 def token_loss(model: Any, rows: Packed) -> Tensor:
@@ -166,5 +194,6 @@ def _rows(
     else:
         own, held = hold_out(own, settings.held_out, settings.seed)
     if settings.pack:
+        require_packable(loaded.model, settings.max_tokens)
         return pack(own, settings.max_tokens), pack(held, settings.max_tokens)
     return [row_of([example]) for example in own], [row_of([example]) for example in held]
