@@ -11,10 +11,10 @@ from tightrope.language.ledger import Job, ledger
 from tightrope.language.models import attention_window, load_causal, parts
 from tightrope.language.packing import collate, row_of
 from tightrope.language.reward_model import load_reward
-from tightrope.language.sampling import draw, sample
+from tightrope.language.sampling import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample
 from tightrope.language.sft import require_packable, token_loss
 from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.language.trainer import LOG_RATIO_LIMIT, LOWERED_LIMIT, Trainer
+from tightrope.language.trainer import Trainer
 from tightrope.language.trunk import Trunk
 
 COMMON = {

@@ -89,7 +89,7 @@ def test_a_metric_that_is_never_logged_is_not_declared() -> None:
 
 
 def test_the_tolerance_of_language_is_told_where_ratios_are_watched() -> None:
-    from tightrope.language.trainer import LOG_RATIO_LIMIT
+    from tightrope.language.sampling import LOG_RATIO_LIMIT
 
     assert f"language: up to {LOG_RATIO_LIMIT:g}" in METRICS["train/log_ratio_first"].doc
 

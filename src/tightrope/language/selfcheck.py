@@ -16,9 +16,9 @@ from tightrope.language.data import Prompt, pad_left, pad_right
 from tightrope.language.policy_model import PolicyModel
 from tightrope.language.rewards import Scores
 from tightrope.language.roles import Roles, make_roles
+from tightrope.language.sampling import log_ratio_limit
 from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.language.trainer import log_ratio_limit
 from tightrope.runs.findings import Finding
 
 WORDS = ("The", "Once upon a time there was", "I think that", "a b c d e f g h")

@@ -35,6 +35,7 @@ from tightrope.language.policy_model import PolicyModel
 from tightrope.language.ptx import Pretraining
 from tightrope.language.roles import Roles, make_roles
 from tightrope.language.samples import sample_rows
+from tightrope.language.sampling import log_ratio_limit
 from tightrope.language.saving import save_model, save_state
 from tightrope.language.scoring import (
     Judge,
@@ -49,14 +50,6 @@ from tightrope.maths.values import explained_variance
 from tightrope.runs import signals
 from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run
-
-LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
-LOWERED_LIMIT = 0.5  # nats, bfloat16: two passes round otherwise; a wrong mask or position costs several
-
-
-def log_ratio_limit(dtype: str) -> float:
-    """The largest gap of two passes over one token that is rounding, in nats."""
-    return LOG_RATIO_LIMIT if dtype == "float32" else LOWERED_LIMIT
 
 
 @dataclass(frozen=True)
