@@ -17,7 +17,7 @@ from tightrope.language.models import parts
 from tightrope.language.token_stats import Sampling, shape_logits
 
 LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
-# nats, bfloat16: two passes round otherwise, by up to 0.54 in 86,000 tokens of SmolLM2; a wrong mask costs more
+# nats, bfloat16: two passes differ by up to 0.54 in 86,000 tokens of SmolLM2; a wrong mask costs more
 LOWERED_LIMIT = 1.0
 
 
