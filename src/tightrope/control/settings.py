@@ -102,8 +102,7 @@ class TrainSettings:
     )
     checkpoint_every: float | None = setting(
         0.05,
-        "Fraction of the run between checkpoints; environments that cannot give their state begin anew "
-        "there, by default after an episode at least; none: only the last.",
+        "Fraction of the run between checkpoints, where most environments begin anew; none: only the last.",
         above=0,
         at_most=1,
     )
