@@ -191,6 +191,14 @@ def test_sampling_and_training_may_differ_by_rounding_alone_in_every_precision(d
     for gap in (limit * 1.01, float("nan")):
         with pytest.raises(SamplingMismatch, match=r"KV cache.*window"):
             trainer._check_sampling(gap)
+    trainer.iteration = 1
+    if dtype == "float32":
+        with pytest.raises(SamplingMismatch):
+            trainer._check_sampling(limit * 1.01)
+    else:
+        trainer._check_sampling(limit * 1.01)  # one token of many, late in a run
+    with pytest.raises(SamplingMismatch):
+        trainer._check_sampling(float("nan"))
 
 
 def test_sampling_from_a_scaled_model_is_not_from_its_head(tmp_path):
