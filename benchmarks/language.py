@@ -97,7 +97,7 @@ def rate(
     return {"rate": tokens / wall, "memory_mb": long["memory_mb"], "short": short, "long": long}
 
 
-def make_reward(name: str, folder: str, full: bool, out: Path) -> str:
+def make_reward(name: str, folder: str, full: bool, out: str) -> None:
     """A reward model as the row has it; how good it is does not matter for its speed."""
     from tightrope.language import RewardSettings, train_reward
 
@@ -107,7 +107,6 @@ def make_reward(name: str, folder: str, full: bool, out: Path) -> str:
     layers = None if tune == "full" else stage["lora_layers"]
     settings = RewardSettings(model=folder, data="-", tune=tune, lora_layers=layers, minibatch_size=16)
     train_reward(settings, data=rows, run_dir=out)
-    return str(out)
 
 
 def compare(
@@ -125,7 +124,10 @@ def compare(
     for layout in layouts:
         values = values_of(name, layout)
         full = values["tune"] == "full"
-        reward = make_reward(name, folder, full, rewards / f"{name}-{layout}")
+        reward = str(rewards / f"{name}-{layout}")
+        job_of_reward = json.dumps({"name": name, "folder": folder, "full": full, "out": reward})
+        # in a process of its own: the system counts the peak of a parent as its children's
+        run_process([sys.executable, __file__, "reward", job_of_reward], our_environment())
         between = shape["peer"] if full else shape["ours"]  # every weight takes about as long as the peer
         mine = job | {"values": values, "reward": reward}
         contenders[layout] = ([sys.executable, __file__, "ours"], mine, between, our_environment())
@@ -207,6 +209,9 @@ def main(words: list[str] | None = None) -> None:
     words = sys.argv[1:] if words is None else words
     if words and words[0] == "ours":
         Path(words[2]).write_text(json.dumps(ours(json.loads(words[1]))), encoding="utf-8")
+        return
+    if words and words[0] == "reward":
+        make_reward(**json.loads(words[1]))
         return
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--peer-python", help="interpreter with trl==1.12.0 and datasets")
