@@ -31,7 +31,7 @@ def test_total_steps_are_never_exceeded_and_nearly_used(backend, budget):
 
 
 def test_steps_are_agent_steps_not_phantom_rows():
-    agent = make(vector_backend="vector")
+    agent = make(vector_backend="vector", checkpoint_every=None)  # whose points cut episodes
     totals = [sum(length for _, length, _ in report.episodes) for report in agent.iterate(2000)]
     running = int(agent.collector._lengths.sum())
     assert sum(totals) + running == agent.steps

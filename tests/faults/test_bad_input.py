@@ -174,7 +174,10 @@ class Late(Faulty):
 def test_the_right_environment_and_step_are_named(at, last, what):
     """Also for a true final observation, and for the one after a rollout's last column."""
     agent = tightrope.PPO(
-        lambda: Late("nan", at=at, last=last), vector_backend="serial", **{**SMALL, "num_envs": 4}
+        lambda: Late("nan", at=at, last=last),
+        vector_backend="serial",
+        checkpoint_every=None,
+        **{**SMALL, "num_envs": 4},
     )
     with pytest.raises(BadNumbers, match=rf"Environment 3 .* {what} = nan at step {at}, index 1"):
         agent.learn(400)

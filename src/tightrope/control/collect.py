@@ -87,7 +87,7 @@ class Collector:
         )
         self._step_count = 0
 
-    def reset(self, seed: int, step: int) -> None:
+    def reset(self, seed: int, step: int = 0) -> None:
         """Begin all episodes anew at an agent step, with seeds of (seed, step) alone; those that were running
         are cut: their last step was bootstrapped, and they are not counted.
         """

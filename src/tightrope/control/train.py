@@ -125,7 +125,9 @@ def _continue(
                 report(
                     "update", {"step": step, "total_steps": total_steps, "metrics": metrics, "seconds": wall}
                 )
-                if progress.on_grid:
+                if (
+                    progress.on_grid and step + settings.num_envs <= total_steps
+                ):  # the end has a save of its own
                     _save(agent, run, evaluator.best, wall, report)
                 clock, before = time.perf_counter(), step
             final = evaluator.evaluate()
