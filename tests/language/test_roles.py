@@ -77,6 +77,41 @@ def test_an_update_moves_policy_and_critic_and_never_the_reference(folder, tune,
     assert torch.equal(again[experience.real], gather_reference(fresh(present), experience)[experience.real])
 
 
+@pytest.mark.parametrize("tune, critic", LAYOUTS)
+@pytest.mark.parametrize("kl", ["k1-reward", "exact-split"])
+def test_the_pass_of_the_rollout_is_the_first_of_the_update(folder, tune, critic, kl):
+    """What is said with gradients kept, to rows in another order, is what a pass of its own says."""
+    roles = fresh(settings(folder, tune=tune, critic=critic, kl=kl))
+    parameters = list(roles.parameters())
+    with torch.no_grad():
+        for p in parameters:
+            p += 0.02 * torch.randn(p.shape, generator=torch.Generator().manual_seed(p.numel()))
+    experience = gather(roles, PROMPTS, 1, 0, 2, keep=True)
+    part = to_batch(experience, experience.logp, torch.ones(6, dtype=torch.bool), roles.settings)
+    part = part.select(torch.tensor([4, 0, 3]))
+    found, weights = [], torch.linspace(-1, 1, part.mask.numel()).view(part.mask.shape)
+    for said in (experience.said, None):
+        model = PolicyModel(roles, exact=roles.settings.exact_in_loss, said=said)
+        now = model(part)
+        total = (now.logp * weights).sum() + now.values.square().sum()
+        total = total + model.kl.sum() if roles.settings.exact_in_loss else total
+        gradients = torch.autograd.grad(total, parameters, allow_unused=True, materialize_grads=True)
+        assert any(bool(g.any()) for g in gradients) and model.said is None
+        found.append([now.logp, now.values, *gradients])
+    for kept, own in zip(*found, strict=True):
+        torch.testing.assert_close(kept, own, rtol=1e-3, atol=2e-5)
+
+
+def test_the_pass_of_the_rollout_is_kept_only_where_one_pass_is_an_epoch(folder, monkeypatch):
+    present = settings(folder)
+    assert present.one_pass and not present.with_values(minibatch_size=5).one_pass
+    assert not present.with_values(micro_batch_size=6).one_pass
+    roles = fresh(present)
+    assert gather(roles, PROMPTS, 1, 0, 2).said is None
+    monkeypatch.setattr(policy_model, "PASS", 0)  # then every length is worth a group
+    assert gather(roles, PROMPTS, 1, 0, 2, keep=True).said is None
+
+
 def experienced_again(roles, batch):
     """The same rows with the log-probabilities of the policy as it is now."""
     with torch.no_grad():
@@ -163,9 +198,9 @@ def poison(batch, name):
     return dataclasses.replace(batch, **{name: torch.where(batch.mask, getattr(batch, name), torch.nan)})
 
 
-def test_trimmed_keeps_every_real_column():
+def test_trimmed_keeps_every_state_that_is_asked_for():
     real = torch.tensor([[0, 0, 1, 1, 1, 0, 0], [0, 1, 1, 1, 1, 1, 0]]).bool()
-    assert trimmed(real, real[:, 4:]) == (1, 6)
+    assert trimmed(real, real[:, 4:]) == (1, 5)
 
 
 def test_rows_of_different_lengths_go_in_groups_of_like_ones():

@@ -13,6 +13,7 @@ from tightrope.language.collect import gather
 from tightrope.language.data import Prompt
 from tightrope.language.fitting import silent
 from tightrope.language.kl import KL_FORMS, AdaptiveKL
+from tightrope.language.policy_model import PolicyModel
 from tightrope.language.reward_model import train_reward
 from tightrope.language.settings import AlignSettings, RewardSettings
 from tightrope.language.trainer import Trainer, hold_out
@@ -95,6 +96,22 @@ def test_micro_batches_change_no_metric(folder, form):
         found.append({name: x for name, x in metrics.items() if name[:5] != "time/"})
     assert found[0] == pytest.approx(found[1], rel=1e-2, abs=1e-4)
     assert found[0]["train/kl_loss"] > 0.05
+
+
+def test_the_pass_that_the_rollout_keeps_changes_no_metric(folder, monkeypatch):
+    """Batches of one pass: three iterations, with the rollout's pass as the first one and without."""
+    values = {"minibatch_size": 16, "num_epochs": 2, "total_episodes": 48, "critic_warmup": 1}
+    taken, found = [], []
+    init = PolicyModel.__init__
+    counted = lambda *a, said=None, **k: taken.append(said is not None) or init(*a, said=said, **k)  # noqa: E731
+    monkeypatch.setattr(PolicyModel, "__init__", counted)
+    for micro in (None, 16):
+        made = shaken(trainer(folder, micro_batch_size=micro, **values))
+        rows = [metrics for metrics, _ in made.iterate()]
+        found.append([{name: x for name, x in row.items() if name[:5] != "time/"} for row in rows])
+    assert taken == [False, True, True, False, False, False]  # never while the critic alone warms up
+    for kept, own in zip(*found, strict=True):
+        assert kept == pytest.approx(own, rel=1e-2, abs=1e-3)
 
 
 @pytest.mark.parametrize("micro", [1, 3, 5])

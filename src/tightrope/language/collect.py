@@ -15,6 +15,7 @@ from torch import Tensor
 from tightrope.algorithms.batch import Batch
 from tightrope.language.data import Prompt, pad_left
 from tightrope.language.kl import kl_rewards
+from tightrope.language.policy_model import Said, length_groups
 from tightrope.language.rewards import Scores
 from tightrope.language.roles import Roles
 from tightrope.language.sampling import Responses, sample
@@ -30,7 +31,7 @@ class Experience:
 
     ``logp``, ``ref_logp``, ``entropy``, ``exact`` (KL of the state), ``values``: [B, R]. ``final_values``
     [B]: V of the state after the last token. ``lower`` and ``ref_hidden`` are kept for the epochs that
-    follow.
+    follow, ``said`` for the first one: the same numbers with their gradients.
     """
 
     tokens: Tensor
@@ -44,6 +45,7 @@ class Experience:
     final_values: Tensor
     lower: Tensor | None
     ref_hidden: Tensor | None
+    said: Said | None
     seconds: float
 
     @property
@@ -73,9 +75,13 @@ class PromptOrder:
         return taken
 
 
-def gather(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Experience:
-    """``samples`` responses to each prompt, and what policy, reference and critic say of them. No
-    gradients.
+def gather(
+    roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int, *, keep: bool = False
+) -> Experience:
+    """``samples`` responses to each prompt, and what policy, reference and critic say of them.
+
+    No gradients; with ``keep``, and where responses of about one length need no groups, what is said keeps
+    its own for an update whose first pass is over all rows: that would say the same again.
     """
     settings = roles.settings
     begin = time.perf_counter()
@@ -91,21 +97,23 @@ def gather(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, s
     seconds = time.perf_counter() - begin
     tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
     real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
-    size = settings.update.micro_batch_size or rows
+    keep = keep and len(length_groups(real, responses.mask)) == 1
+    size = rows if keep else settings.update.micro_batch_size or rows
     # a folded weight rounds otherwise than weight and adapter apart, which is what trains: in float32 within
     # the tolerance, in bfloat16 far beyond it
-    exact = settings.dtype == "float32"
-    with roles.frozen_policy() if exact else contextlib.nullcontext():
+    folded = settings.dtype == "float32" and not keep
+    with roles.frozen_policy() if folded else contextlib.nullcontext(), torch.set_grad_enabled(keep):
         pieces = [_look(roles, tokens, real, responses, slice(k, k + size)) for k in range(0, rows, size)]
+    said = tuple(pieces[0][name] for name in ("logp", "entropy", "exact", "values")) if keep else None
+    pieces = [{name: None if x is None else x.detach() for name, x in piece.items()} for piece in pieces]
     joined = {name: _joined([piece[name] for piece in pieces]) for name in pieces[0]}
-    return Experience(tokens=tokens, real=real, responses=responses, seconds=seconds, **joined)
+    return Experience(tokens=tokens, real=real, responses=responses, said=said, seconds=seconds, **joined)
 
 
 def _joined(parts: list[Any]) -> Any:
     return None if parts[0] is None else torch.cat(parts)
 
 
-@torch.no_grad()
 def _look(roles: Roles, tokens: Tensor, real: Tensor, responses: Responses, rows: slice) -> dict[str, Any]:
     """What the roles say of some rows."""
     tokens, real, mask = tokens[rows], real[rows], responses.mask[rows]
@@ -117,6 +125,7 @@ def _look(roles: Roles, tokens: Tensor, real: Tensor, responses: Responses, rows
     own = token_statistics(
         policy[:, first:-1][mask], roles.trunk.parts.head, responses.tokens[rows][mask], roles.sampling,
         support=support, reference=reference[mask], reference_head=roles.head_of_reference(),
+        ahead=roles.settings.logp_alone,
     )  # fmt: skip
     zeros = torch.zeros(mask.shape, device=tokens.device)
     values, final = zeros, zeros[:, 0]
@@ -197,6 +206,7 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
         targets = returns.gae(*steps, critic_lambda, mask) + values
     old = experience.responses.logp if settings.dtype == "float32" else experience.logp
     inputs = {"tokens": experience.tokens, "real": experience.real, "ref_logp": experience.ref_logp}
+    inputs["row"] = torch.arange(len(mask), device=mask.device)
     optional = {
         "lower": experience.lower, "ref_hidden": experience.ref_hidden,
         "support": experience.responses.support,

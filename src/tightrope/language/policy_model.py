@@ -10,22 +10,30 @@ from tightrope.language.roles import Roles
 from tightrope.language.token_stats import token_statistics
 
 MOST_GROUPS, PASS = 4, 64
+Said = tuple[
+    Tensor, Tensor, Tensor, Tensor
+]  # of all rows [B, R]: log p, entropy, KL to the reference, values
 
 
 class PolicyModel:
     """What ppo.update trains: Batch -> Evaluation, each [B, R]; padding is cut off before the forward pass.
 
     ``exact``: also the exact KL to the reference of every state, left in ``kl`` for the loss ([B, R]).
+    ``said``: what the rollout's own pass says, with its gradients; taken once, for the first question.
     """
 
-    def __init__(self, roles: Roles, *, exact: bool = False, critic_alone: bool = False) -> None:
-        self.roles, self.exact, self.critic_alone = roles, exact, critic_alone
-        frozen_head = roles.settings.tune == "lora"
-        self.ahead = frozen_head and not exact and not roles.settings.update.entropy_weight
+    def __init__(
+        self, roles: Roles, *, exact: bool = False, critic_alone: bool = False, said: Said | None = None
+    ) -> None:
+        self.roles, self.exact, self.critic_alone, self.said = roles, exact, critic_alone, said
         self.kl: Tensor | None = None
 
     def __call__(self, part: Batch) -> Evaluation:
         """Log-probabilities and entropies of the policy, and the critic's values, where the mask is True."""
+        if self.said is not None:
+            said, self.said = self.said, None
+            logp, entropy, self.kl, values = (x[part.inputs["row"]] for x in said)
+            return Evaluation(logp, entropy, values)
         groups = length_groups(part.inputs["real"], part.mask)
         if len(groups) == 1:
             logp, entropy, self.kl, values = self._rows(part)
@@ -43,7 +51,7 @@ class PolicyModel:
         tokens, real = (part.inputs[name][:, left:right] for name in ("tokens", "real"))
         lower = part.inputs["lower"][:, left:right] if "lower" in part.inputs else None
         first = length - columns - left - 1  # the state in which the first response token is chosen
-        here = mask[:, : right - length + columns]
+        here = mask[:, : right + 1 - length + columns]
 
         def steps(hidden: Tensor) -> Tensor:
             return hidden[:, first : first + here.shape[1]][here]
@@ -57,7 +65,7 @@ class PolicyModel:
             support=None if support is None else support[mask],
             reference=None if reference is None else reference[mask],
             reference_head=roles.head_of_reference(),
-            ahead=self.ahead,
+            ahead=roles.settings.logp_alone,
         )  # fmt: skip
         values = found.logp.new_zeros(len(found.logp))
         if roles.critic_head is not None:
@@ -93,10 +101,12 @@ def _spread(x: Tensor, mask: Tensor) -> Tensor:
 
 
 def trimmed(real: Tensor, mask: Tensor) -> tuple[int, int]:
-    """The columns [left, right) of [B, P + R] that hold a real prompt token or a counting response token."""
+    """The columns [left, right) of [B, P + R] whose states matter: from the first real prompt token to the
+    token before the last counting one, in whose state that is chosen.
+    """
     prompt = real.shape[1] - mask.shape[1]
     any_prompt = real[:, :prompt].any(0).nonzero()
     any_response = mask.any(0).nonzero()
     left = int(any_prompt[0]) if len(any_prompt) else prompt - 1
-    right = prompt + (int(any_response[-1]) + 1 if len(any_response) else 1)
+    right = prompt + (int(any_response[-1]) if len(any_response) else 0)
     return left, right

@@ -234,6 +234,16 @@ class AlignSettings(ModelSettings):
         """Whether the exact KL of every state is part of the loss."""
         return self.kl in ("exact-split", "exact-loss")
 
+    @property
+    def logp_alone(self) -> bool:
+        """Whether log p is all of the head's work that is trained on, and the head itself is not."""
+        return self.tune == "lora" and not self.exact_in_loss and not self.update.entropy_weight
+
+    @property
+    def one_pass(self) -> bool:
+        """Whether an epoch is one forward pass over all responses."""
+        return self.update.minibatch_size >= self.batch_size and self.update.micro_batch_size is None
+
     def with_values(self, **values: Any) -> Self:
         """The same settings with these changed; names of the update rule's fields are found there."""
         outer = {field.name for field in dataclasses.fields(self)}

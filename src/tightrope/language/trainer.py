@@ -32,7 +32,7 @@ from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.models import context_length, find_model, parameter_counts
 from tightrope.language.monitor import Monitor
-from tightrope.language.policy_model import PolicyModel
+from tightrope.language.policy_model import PolicyModel, Said
 from tightrope.language.ptx import Pretraining
 from tightrope.language.roles import Roles, make_roles
 from tightrope.language.samples import sample_rows
@@ -75,11 +75,8 @@ class Trainer:
     ) -> None:
         self.settings, self.report = settings, report
         adapter = reward_adapter(reward)
-        shared = (
-            adapter is not None
-            and settings.tune == "lora"
-            and shares_trunk(adapter, find_model(settings.model))
-        )
+        lora = settings.tune == "lora"
+        shared = adapter is not None and lora and shares_trunk(adapter, find_model(settings.model))
         on_trunk = adapter if shared else None
         self.roles: Roles = make_roles(
             settings,
@@ -210,7 +207,9 @@ class Trainer:
         settings, begin = self.settings, time.perf_counter()
         present = settings.update.at(self.episodes / settings.total_episodes)
         set_learning_rates(self.optimiser, present)
-        experience = gather(self.roles, prompts, settings.seed, self.iteration, settings.samples_per_prompt)
+        stream = (settings.seed, self.iteration, settings.samples_per_prompt)
+        keep = settings.one_pass and self.iteration >= settings.critic_warmup
+        experience = gather(self.roles, prompts, *stream, keep=keep)
         gathered = time.perf_counter()
         asked = [prompt for prompt in prompts for _ in range(settings.samples_per_prompt)]
         scores = self.judge(asked, experience, self._trainer_state())
@@ -229,7 +228,7 @@ class Trainer:
         self._watch(metrics)
         judged = time.perf_counter()
         if len(batch) and not self.stopped:
-            metrics |= self._update(batch, present)
+            metrics |= self._update(batch, present, experience.said)
             if settings.critic != "none":
                 metrics["train/explained_variance"] = float(
                     explained_variance(batch.old_values, batch.returns, batch.mask)
@@ -251,10 +250,11 @@ class Trainer:
             self.roles.tokenizer, asked, experience, scores, batch, valid, self.episodes
         )
 
-    def _update(self, batch: Batch, present: Any) -> dict[str, float]:
+    def _update(self, batch: Batch, present: Any, said: Said | None) -> dict[str, float]:
         """PPO, or the critic alone while it warms up."""
         warming = self.iteration < self.settings.critic_warmup
-        model = PolicyModel(self.roles, exact=self.settings.exact_in_loss, critic_alone=warming)
+        asked = {"exact": self.settings.exact_in_loss, "critic_alone": warming, "said": said}
+        model = PolicyModel(self.roles, **asked)
         if warming:
             batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
             present = present.unchecked(entropy_weight=0.0, target_kl=None)
