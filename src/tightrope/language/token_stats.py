@@ -129,7 +129,7 @@ class _Chunked(torch.autograd.Function):
         if ctx.slope is not None and states == [None, None] and not (need_weight or need_bias):
             return ctx.slope * outer[0][:, None].to(hidden.dtype), *[None] * 9
         to_hidden = torch.empty_like(hidden) if need_hidden else None
-        to_weight = torch.zeros_like(weight) if need_weight else None
+        to_weight: Tensor | None = None
         to_bias = torch.zeros_like(bias) if need_bias and bias is not None else None
         chunks = _Chunks(ctx.saved_tensors, ctx.sampling)
         for rows in chunks:
@@ -137,7 +137,9 @@ class _Chunked(torch.autograd.Function):
             gradient = chunks.gradient(rows, outer[0][rows, None], *here)
             if to_hidden is not None:
                 to_hidden[rows] = gradient @ weight
-            if to_weight is not None:
+            if need_weight and to_weight is None:
+                to_weight = gradient.T @ hidden[rows]
+            elif to_weight is not None:
                 to_weight.addmm_(gradient.T, hidden[rows])
             if to_bias is not None:
                 to_bias += gradient.sum(0)

@@ -253,8 +253,8 @@ class Trainer:
     def _update(self, batch: Batch, present: Any, said: Said | None) -> dict[str, float]:
         """PPO, or the critic alone while it warms up."""
         warming = self.iteration < self.settings.critic_warmup
-        asked = {"exact": self.settings.exact_in_loss, "critic_alone": warming, "said": said}
-        model = PolicyModel(self.roles, **asked)
+        exact = self.settings.exact_in_loss
+        model = PolicyModel(self.roles, exact=exact, critic_alone=warming, said=said)
         if warming:
             batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
             present = present.unchecked(entropy_weight=0.0, target_kl=None)
