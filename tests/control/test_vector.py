@@ -16,6 +16,7 @@ import pytest
 
 from tightrope.control import workers
 from tightrope.control.environments import EnvironmentFault, make_environments
+from tightrope.control.faults import FaultPolicy
 
 COUNT = 40
 
@@ -120,11 +121,13 @@ class Broken(chain.Chain):
         }[self.how]
 
 
-def run_broken(how: str, after: int = 0, num_workers: int = 1) -> None:
+def run_broken(how: str, after: int = 0, num_workers: int = 1, timeout: float = 60.0) -> None:
     def factory():
         return Broken(how, after)
 
-    with make_environments(factory, 2, backend="workers", num_workers=num_workers) as environments:
+    with make_environments(
+        factory, 2, backend="workers", num_workers=num_workers, policy=FaultPolicy(timeout=timeout)
+    ) as environments:
         inputs, _ = environments.reset(chain.BASE_SEED)
         for _ in range(after + 2):
             inputs = environments.step(chain.action_for(inputs["flat"])).inputs
@@ -172,11 +175,10 @@ def test_a_dead_worker_is_reported_with_its_exit_code():
         run_broken("dies", after=2, num_workers=2)
 
 
-def test_a_hanging_worker_is_reported_and_killed(monkeypatch):
-    monkeypatch.setattr(workers, "PATIENCE", 1.0)
+def test_a_hanging_worker_is_reported_and_killed():
     begin = time.perf_counter()
     with pytest.raises(EnvironmentFault, match="has not answered for 1 s"):
-        run_broken("hangs", after=2, num_workers=2)
+        run_broken("hangs", after=2, num_workers=2, timeout=1.0)
     assert time.perf_counter() - begin < 10
 
 

@@ -75,7 +75,12 @@ GOOD = [{"prompt": text, "answer": text} for text in ("ab", "cd", "efg")]
         ),
         ([{"prompt": [{"role": "user", "content": "a"}]}], "good", [], ["no chat template"]),
         (GOOD, "good", ["--max-prompt-tokens", "95"], ["95", "context of 96 tokens", "Choose less"]),
-        (GOOD, "good", ["--learning-rate", "1e9"], ["The gradient holds a NaN", "learning rate"]),
+        (
+            GOOD,
+            "good",
+            ["--learning-rate", "1e9"],
+            ["expected a finite number", "not taken", "learning rate"],
+        ),
         (GOOD, "raises", [], ["'raises' raised KeyError", "line 4 of mine.py"]),
         (GOOD, "hangs", ["--reward-timeout", "0.1"], ["last 3 batches", "'hangs' was not back after 0.1 s"]),
         (GOOD, "short", [], ["'short' returned 1 scores, expected a list of 8"]),

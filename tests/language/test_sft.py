@@ -121,7 +121,7 @@ def test_a_gradient_that_is_not_finite_stops_before_the_step():
 
     objective = dataclasses.replace(objective_of(model, rows), loss=loss)
     optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
-    with pytest.raises(NonFiniteError):
+    with pytest.raises(NonFiniteError, match="The loss is nan in this step"):
         take_step(objective, rows, optimiser, Brake(torch.device("cpu")), settings_of())
     assert all(torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
 

@@ -8,6 +8,7 @@ Read beside ppo.py: epochs, minibatches, the clip and the KL stop are what it le
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -15,6 +16,8 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms.batch import Batch, Evaluation
+from tightrope.algorithms.memory import Parts
+from tightrope.algorithms.nonfinite import explain
 from tightrope.algorithms.optimise import Brake, Meter, book_ratios, check_first_ratios
 from tightrope.algorithms.settings import A2CSettings
 from tightrope.maths import statistics, surrogate, values
@@ -43,12 +46,12 @@ def update(
     ``log_ratio_limit``.
     """
     meter, brake, batch = Meter(), Brake(batch.mask.device), batch.cleared()
-    optimiser.zero_grad(set_to_none=True)
     if settings.normalise_advantages:
         advantages = statistics.standardise(batch.advantages, batch.mask)
         batch = dataclasses.replace(batch, advantages=advantages)
     count = batch.mask.sum()
-    for part in batch.split(settings.micro_batch_size):
+
+    def gradient(part: Batch) -> Tensor:
         now = model(part).within(part.mask)
         log_ratio = surrogate.log_ratio(now.logp, part.old_logp, part.mask)
         policy = surrogate.policy_gradient(now.logp, part.advantages)
@@ -61,9 +64,15 @@ def update(
             meter.add(part.mask, **extra_metrics)
         total.backward()
         meter.add(part.mask, policy_gradient_loss=policy, value_loss=value, entropy=now.entropy)
-        book_ratios(meter, log_ratio, part.mask, torch.inf, torch.inf)
         check_first_ratios(log_ratio, log_ratio_limit)
         meter.extreme("log_ratio_first", log_ratio.abs(), largest=True)
+        kl = book_ratios(meter, log_ratio, part.mask, torch.inf, torch.inf)
+        return torch.stack([kl, total.detach().to(kl)])
+
+    parts = Parts(settings.micro_batch_size)
+    sums = parts.sum(batch, optimiser, meter, gradient)
+    brake.bad = brake.bad | ~torch.isfinite(sums).all()
     brake.step(optimiser, settings.max_grad_norm, meter)
-    brake.halted(poll=True)
-    return {**meter.means(), "train/minibatches": float(brake.steps)}
+    look = functools.partial(explain, model, optimiser, batch, batch, "in this update", sums)
+    brake.halted(look, poll=True)
+    return {**meter.means(), **parts.metrics(), "train/minibatches": float(brake.steps)}

@@ -4,18 +4,16 @@ minibatch.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from tightrope.algorithms.nonfinite import REFUSED, NonFiniteError
 from tightrope.algorithms.settings import UpdateSettings
 from tightrope.maths import divergence, statistics, surrogate
-
-
-class NonFiniteError(FloatingPointError):
-    """A NaN or an infinity was met before a step; the weights are as they were before that step."""
 
 
 class SamplingMismatch(RuntimeError):
@@ -110,6 +108,14 @@ class Meter:
         x = x.max() if largest else x.min()
         self._extremes[key] = pick(self._extremes[key], x) if key in self._extremes else x
 
+    def books(self) -> tuple[dict[str, Any], ...]:
+        """All sums as they stand, to go back to with `restore`."""
+        return tuple(dict(x) for x in (self._sums, self._counts, self._extremes))
+
+    def restore(self, books: tuple[dict[str, Any], ...]) -> None:
+        """Forget what was added since ``books`` were taken."""
+        self._sums, self._counts, self._extremes = (dict(x) for x in books)
+
     def means(self) -> dict[str, float]:
         """One read of the device: the mean of every sum, and the extremes."""
         names = [*self._sums, *self._extremes]
@@ -148,9 +154,12 @@ class Brake:
         """Clip by one joint norm over all parameters and take the step, unless the brake is on."""
         parameters = [p for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
         norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-        self.bad = self.bad | ~torch.isfinite(norm)
+        # infinite weights too: behind a saturated unit their gradient is 0
+        largest = nn.utils.get_total_norm([p.detach() for p in parameters], norm_type=math.inf)
+        self.bad = self.bad | ~(torch.isfinite(norm) & torch.isfinite(largest))
         if max_grad_norm is not None:
-            nn.utils.clip_grads_with_norm_(parameters, max_grad_norm, norm)
+            scale = torch.where(self.bad, 0.0, norm)  # 0: a bad gradient stays as it is, to be looked at
+            nn.utils.clip_grads_with_norm_(parameters, max_grad_norm, scale)
         halted = self.kl | self.bad
         self.steps += ~halted
         fused = all(group.get("fused") for group in optimiser.param_groups)
@@ -161,17 +170,14 @@ class Brake:
             optimiser.step()
         meter.add_sum("grad_norm", norm.detach(), 1.0)
 
-    def halted(self, *, poll: bool = False) -> bool:
-        """Whether to stop; raises NonFiniteError for a bad gradient. Waits for an accelerator only when
-        polled.
+    def halted(self, explain: Callable[[], str] | None = None, *, poll: bool = False) -> bool:
+        """Whether to stop; raises NonFiniteError for a bad gradient, with what ``explain`` says of it. Waits
+        for an accelerator only when polled.
         """
         if self._lazy and not poll:
             return False
         if bool(self.bad):
-            raise NonFiniteError(
-                "The gradient holds a NaN or an infinity; that step was not taken and the weights are as "
-                "before it. Look for extreme rewards, observations or a learning rate that is too high."
-            )
+            raise NonFiniteError(explain() if explain else f"The gradient holds a NaN; {REFUSED}")
         return bool(self.kl)
 
 
@@ -183,7 +189,7 @@ def check_first_ratios(log_ratio: Tensor, limit: float | None) -> None:
     if limit is None:
         return
     worst = float(log_ratio.detach().abs().max())
-    if not worst <= limit:
+    if math.isfinite(worst) and worst > limit:  # what is not finite is named before the step
         raise SamplingMismatch(
             f"Before any update the log-probabilities differ by {worst:.3g} from those that sampled (limit "
             f"{limit:g}). Sampling and training disagree. Likely causes: dropout or batch normalisation left "

@@ -9,6 +9,7 @@ Read beside a2c.py: epochs, minibatches, the clip and the KL stop are all that i
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -16,6 +17,8 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms.batch import Batch, Evaluation
+from tightrope.algorithms.memory import Parts
+from tightrope.algorithms.nonfinite import explain
 from tightrope.algorithms.optimise import Brake, Meter, book_ratios, check_first_ratios
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.maths import statistics, surrogate, values
@@ -70,17 +73,18 @@ def update(
     """
     meter, brake, batch = Meter(), Brake(batch.mask.device), batch.cleared()
     clip_high = settings.clip if settings.clip_high is None else settings.clip_high
-    first = True
+    parts, number, earlier = Parts(settings.micro_batch_size), 0, 0
     for epoch in range(settings.num_epochs):
         if epoch and refresh is not None and settings.recompute_advantages:
             batch = refresh(batch).cleared()
         for minibatch in batch.minibatches(settings.minibatch_size, rng):
-            optimiser.zero_grad(set_to_none=True)
+            number += 1
             if settings.normalise_advantages:
                 advantages = statistics.standardise(minibatch.advantages, minibatch.mask)
                 minibatch = dataclasses.replace(minibatch, advantages=advantages)
-            count, kl_sum = minibatch.mask.sum(), torch.zeros((), device=batch.mask.device)
-            for part in minibatch.split(settings.micro_batch_size):
+            count = minibatch.mask.sum()
+
+            def gradient(part: Batch, count: Tensor = count, first: bool = number == 1) -> Tensor:
                 now = model(part).within(part.mask)
                 log_ratio = surrogate.log_ratio(now.logp, part.old_logp, part.mask)
                 policy = policy_loss(log_ratio, part.advantages, settings)
@@ -93,16 +97,22 @@ def update(
                     meter.add(part.mask, **extra_metrics)
                 total.backward()
                 meter.add(part.mask, policy_gradient_loss=policy, value_loss=value, entropy=now.entropy)
-                kl_sum += book_ratios(meter, log_ratio, part.mask, settings.clip, clip_high)
                 if first:
                     check_first_ratios(log_ratio, log_ratio_limit)
                     meter.extreme("log_ratio_first", log_ratio.abs(), largest=True)
-            first = False
+                kl = book_ratios(meter, log_ratio, part.mask, settings.clip, clip_high)
+                return torch.stack([kl, total.detach().to(kl)])
+
+            sums = parts.sum(minibatch, optimiser, meter, gradient)
+            brake.bad = brake.bad | ~torch.isfinite(sums).all()
             if settings.target_kl is not None:
-                brake.kl = brake.kl | (kl_sum / count > settings.target_kl)
+                brake.kl = brake.kl | (sums[0] / count > settings.target_kl)
             brake.step(optimiser, settings.max_grad_norm, meter)
-            if brake.halted():
+            where = f"in minibatch {number - earlier} of epoch {epoch + 1}"
+            look = functools.partial(explain, model, optimiser, batch, minibatch, where, sums)
+            if brake.halted(look):
                 break
-        if brake.halted(poll=True):
+        if brake.halted(look, poll=True):
             break
-    return {**meter.means(), "train/minibatches": float(brake.steps)}
+        earlier = number
+    return {**meter.means(), **parts.metrics(), "train/minibatches": float(brake.steps)}

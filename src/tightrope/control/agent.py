@@ -20,6 +20,7 @@ from tightrope.algorithms.settings import PPOSettings
 from tightrope.control import engines
 from tightrope.control.collect import Collector, Rollout, to_batch
 from tightrope.control.environments import Environments, available_cores, make_environments
+from tightrope.control.faults import policy_of
 from tightrope.control.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policies import Policy
 from tightrope.control.resolve import resolve
@@ -38,7 +39,7 @@ class Progress:
     """One update of a run: agent steps so far, the budget, every metric, and the episodes that ended.
 
     ``on_grid``: the update reached a point of the checkpoint grid; environments that cannot give their state
-    begin anew behind it, whether or not anything is saved.
+    begin anew behind it, whether or not anything is saved. ``before``: ``step`` before the update.
     """
 
     step: int
@@ -46,6 +47,7 @@ class Progress:
     metrics: dict[str, float]
     episodes: list[tuple[float, int, bool]]
     on_grid: bool = False
+    before: int = 0
 
 
 class Agent:
@@ -89,7 +91,7 @@ class Agent:
         seeds = ([present.seed, k] for k in (1, 2, 4))
         self.sampling_rng, self.update_rng, self.predict_rng = (np.random.default_rng(x) for x in seeds)
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
-        self.steps, self.kl_beta = 0, getattr(present.update, "kl_beta", None)
+        self.steps, self.rollbacks, self.kl_beta = 0, 0, getattr(present.update, "kl_beta", None)
         self.fresh, self.notify = True, notify  # fresh: episodes begin anew with the next rollout
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
 
@@ -121,7 +123,7 @@ class Agent:
             first, after = False, self.steps - start
             on_grid = crosses(before, after, budget, every)
             self.fresh = on_grid and not self.environments.gives_state
-            yield Progress(after, budget, metrics, episodes, on_grid)
+            yield Progress(after, budget, metrics, episodes, on_grid, before)
 
     def _next_columns(self, budget: int, start: int) -> int:
         """Columns of the next rollout, never more than the budget allows; a crumb at its end is left
@@ -306,9 +308,9 @@ def _resolved(
 
 def _environments(env: Any, settings: TrainSettings) -> Environments:
     source = settings.env if env is None else env
-    backend, workers = settings.vector_backend, settings.num_workers
+    backend, workers, policy = settings.vector_backend, settings.num_workers, policy_of(settings)
     return make_environments(
-        source, settings.num_envs, backend=backend, num_workers=workers, squash=settings.squash
+        source, settings.num_envs, backend=backend, num_workers=workers, squash=settings.squash, policy=policy
     )
 
 
@@ -338,10 +340,10 @@ def _settings_metrics(present: Any) -> dict[str, float]:
 
 
 def _episode_metrics(rollout: Rollout) -> dict[str, float]:
-    if not rollout.episodes:
-        return {"rollout/episodes": 0.0}
-    return {
-        "rollout/ep_rew_mean": float(np.mean([e[0] for e in rollout.episodes])),
-        "rollout/ep_len_mean": float(np.mean([e[1] for e in rollout.episodes])),
-        "rollout/episodes": float(len(rollout.episodes)),
-    }
+    found = {"rollout/episodes": float(len(rollout.episodes))}
+    if rollout.restarts is not None:
+        found["rollout/environment_restarts"] = float(rollout.restarts)
+    if rollout.episodes:
+        found["rollout/ep_rew_mean"] = float(np.mean([e[0] for e in rollout.episodes]))
+        found["rollout/ep_len_mean"] = float(np.mean([e[1] for e in rollout.episodes]))
+    return found

@@ -7,16 +7,18 @@ phantom row). DISABLED: we reset the rows that ended ourselves, with options={"r
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 
 from tightrope.control import states
+from tightrope.control.faults import EnvironmentFault, describe
 from tightrope.control.nested import MASK_KEY
+from tightrope.control.slots import Step
 from tightrope.control.spaces import (
     ActionLayout,
     Inputs,
@@ -24,7 +26,6 @@ from tightrope.control.spaces import (
     action_layout,
     observation_layout,
 )
-from tightrope.control.vector import EnvironmentFault, Step, describe
 
 MODE_KEYS = (
     "autoreset_mode",
@@ -114,8 +115,7 @@ class VectorCopies:
         if not isinstance(result, tuple) or len(result) != 5:
             raise self._fault(
                 f"step returned {describe(result)}, expected five values: observations, rewards, "
-                "terminations, "
-                "truncations, infos"
+                "terminations, truncations, infos"
             )
         observations, rewards, terminated, truncated, infos = result
         rewards, terminated, truncated = self._check(rewards, terminated, truncated)
@@ -320,6 +320,14 @@ class VectorCopies:
             self._env.close()
         self._env = None
 
+    def renew(self, make: Callable[[int], Any], seed: int) -> None:
+        """Go on with another environment, made for this seed; what closing the old one raises is ignored."""
+        with contextlib.suppress(Exception):
+            self.close()
+        fresh = make(seed)
+        self._make = lambda seed: fresh
+        self._use(fresh)
+
 
 def _any(flags: np.ndarray) -> bool:
     """flags.any() for a handful of flags, ten times as fast: this is asked at every step."""
@@ -339,11 +347,3 @@ def _to_int32(actions: Any) -> Any:
     if isinstance(actions, tuple):
         return tuple(_to_int32(value) for value in actions)
     return actions.astype(np.int32) if actions.dtype.kind in "iub" else actions
-
-
-def is_vector_env(env: Any) -> bool:
-    """True for Gymnasium's vector environments, and for EnvPool's, which only look like them."""
-    if isinstance(env, VectorEnv):
-        return True
-    looks_like = hasattr(env, "single_action_space") and hasattr(env, "num_envs")
-    return looks_like and not isinstance(env, gym.Env | type)

@@ -12,9 +12,11 @@ import numpy as np
 import torch
 
 from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
 from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
 from tightrope.control import states
 from tightrope.control.environments import Environments
+from tightrope.control.faults import action_text, circumstances
 from tightrope.control.normalise import Normalisers
 
 Array = np.ndarray
@@ -33,6 +35,8 @@ class BadNumbers(ValueError):
 
 class Rollout:
     """What happened in T steps of B environments. ``mask`` False: NEXT_STEP's reset row, not a transition.
+    With ``ended`` beside it: the step in which an environment failed and was made anew. Its input is the last
+    observation of the episode that was cut, from whose value the step before it is bootstrapped.
 
     ``inputs``: what the policy saw (normalised), ``raw``: flat observations as they came, ``rewards``: as
     they came. ``last``: encoded observation after the last step; ``finals``: (column, rows, encoded true
@@ -65,6 +69,7 @@ class Rollout:
         self.episodes: list[tuple[float, int, bool]] = []
         self.reward_statistics_taken = False
         self.env_seconds = 0.0
+        self.restarts: int | None = None  # environments made anew; None: the settings do not allow it
 
     @property
     def steps(self) -> int:
@@ -85,7 +90,7 @@ class Collector:
         self._uniform = np.concatenate(
             [np.full(c.width, c.kind != "gaussian") for c in environments.action_layout.components]
         )
-        self._step_count = 0
+        self._step_count, self._restarts = 0, 0
 
     def reset(self, seed: int, step: int = 0) -> None:
         """Begin all episodes anew at an agent step, with seeds of (seed, step) alone; those that were running
@@ -105,12 +110,16 @@ class Collector:
         own = {name: states.pack(getattr(self, name)) for name in names}
         return {**own, "environments": self.environments.get_state()}
 
-    def restore(self, seed: int, step: int, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """Go on with the episodes of a `state`."""
-        self.environments.reset(reset_seed(seed, step))
         self.environments.set_state(state["environments"])
         for name in ("_inputs", "_action_mask", "_returns", "_lengths"):
             setattr(self, name, states.unpack(state[name]))
+
+    def count_from(self, restarts: int) -> None:
+        """So many environments were made anew before; the rows so far have told of them."""
+        self.environments.count_from(restarts)
+        self._restarts = restarts
 
     def noise(self, num_steps: int, rows: int, rng: np.random.Generator) -> Array:
         """[T, rows, A] float32: uniforms for categories and bits, standard normals for Gaussian columns."""
@@ -136,6 +145,7 @@ class Collector:
                 shape = (*rollout.logp.shape, self._action_mask.shape[1])
                 rollout.inputs["action_mask"] = np.ones(shape, bool)
         rollout.mask.fill(True)
+        rollout.ended.fill(False)
         rollout.finals, rollout.reward_statistics_taken = [], False
         noise = self.noise(num_steps, self.environments.num_envs, self.rng)
         engine.begin_rollout(self.environments.num_envs, self.rng)
@@ -159,18 +169,24 @@ class Collector:
                 rollout.truncated[:, t] = step.truncated
                 if step.phantom is not None:
                     np.logical_not(step.phantom, out=rollout.mask[:, t])
+                if step.cut is not None:
+                    rollout.mask[step.cut, t], rollout.ended[step.cut, t] = False, True
                 if step.final_rows is not None and step.final_inputs is not None:
                     rollout.finals.append((t, step.final_rows, step.final_inputs))
         except Exception:
-            self._check_numbers(
-                rollout, t + 1
-            )  # a NaN observation is the likelier cause of what failed after it
+            # a NaN observation or a NaN weight is the likelier cause of what failed after it
+            self._check_numbers(rollout, t + 1)
+            self._check_policy(rollout, t + 1, engine)
             raise
         self._inputs, self._action_mask, rollout.env_seconds = inputs, action_mask, env_seconds
         self._check_numbers(rollout, num_steps)
+        self._check_policy(rollout, num_steps, engine)
         rollout.last = self.normalisers.encode(inputs)
         rollout.finals = [(t, rows, self.normalisers.encode(x)) for t, rows, x in rollout.finals]
-        np.logical_or(rollout.terminated, rollout.truncated, out=rollout.ended)
+        rollout.ended |= rollout.terminated | rollout.truncated
+        if self.environments.restartable:
+            rollout.restarts = self.environments.restarts - self._restarts
+            self._restarts = self.environments.restarts
         rollout.episodes = self._count_episodes(rollout)
         self._step_count += num_steps
         return rollout
@@ -180,14 +196,15 @@ class Collector:
         one.
         """
         rows, start = np.arange(len(rollout.logp)), self._step_count
-        checks = [("observation", rollout.raw[:, :num_steps], rows, start)]
-        checks += [("reward", rollout.rewards[:, :num_steps, None], rows, start)]
+        checks = [("observation", rollout.raw[:, :num_steps], rows, start, -1)]
+        checks += [("reward", rollout.rewards[:, :num_steps, None], rows, start, 0)]
         if "flat" in self._inputs:
-            checks.append(("observation", self._inputs["flat"][:, None], rows, start + num_steps))
+            last = self._inputs["flat"][:, None]
+            checks.append(("observation", last, rows, start + num_steps, num_steps - 1))
         for t, final_rows, x in rollout.finals:
             if "flat" in x:
-                checks.append(("final observation", x["flat"][:, None], final_rows, start + t + 1))
-        for what, numbers, which, first in checks:
+                checks.append(("final observation", x["flat"][:, None], final_rows, start + t + 1, t))
+        for what, numbers, which, first, column in checks:  # ``column``: of the action that led there
             good = np.isfinite(numbers)
             if good.all():
                 continue
@@ -195,13 +212,38 @@ class Collector:
             where = f"step {first + t}" + ("" if what == "reward" else f", index {index}")
             raise BadNumbers(
                 f"Environment {which[row]} of {self.environments.spec_id} returned "
-                f"{what} = {numbers[row, t, index]} at {where}; expected finite "
+                f"{what} = {numbers[row, t, index]} at {where}"
+                f"{self._circumstances(rollout, int(which[row]), int(column + t))}; expected finite "
                 "numbers. The policy was not updated with it. Mend the environment, or clip and check its "
-                "state there."
+                "state there; --on-env-fault restart makes it anew and goes on."
             )
 
+    def _check_policy(self, rollout: Rollout, num_steps: int, engine: Any) -> None:
+        """NonFiniteError when the policy gave a log-probability that is not finite; a bad weight is named."""
+        bad = ~np.isfinite(rollout.logp[:, :num_steps])
+        if not bad.any():
+            return
+        row, t = np.argwhere(bad)[0]
+        weight = first_bad((f"the weight {name}", p) for name, p in engine.policy.named_parameters())
+        raise NonFiniteError(
+            f"The policy gave the log-probability {rollout.logp[row, t]} to its action in environment {row} "
+            f"at step {self._step_count + t}; expected a finite number"
+            + (f", but {weight}. " if weight else ": its logits overflow. ")
+            + "It was not updated with this rollout. Look for a learning rate that is too high."
+        )
+
+    def _circumstances(self, rollout: Rollout, row: int, column: int) -> str:
+        """Worker, seed and action of a row, in words."""
+        environments, action = self.environments, None
+        if column >= 0:
+            chosen = rollout.actions[row, column]
+            action = action_text(environments.action_layout.to_env_single(chosen, environments.squash))
+        return circumstances(environments.worker_of(row), environments.seed_of(row), action)
+
     def _count_episodes(self, rollout: Rollout) -> list[tuple[float, int, bool]]:
-        """(return, length, terminated) of every episode that ended in the rollout, in order of its column."""
+        """(return, length, terminated) of every episode that ended in the rollout, in order of its column;
+        one that a fault cut is none.
+        """
         running = np.cumsum(np.where(rollout.mask, rollout.rewards, 0.0), axis=1) + self._returns[:, None]
         lengths = np.cumsum(rollout.mask, axis=1) + self._lengths[:, None]
         found = []
@@ -212,7 +254,8 @@ class Collector:
             for k, t in enumerate(ends):
                 before = (totals[k - 1], counts[k - 1]) if k else (0.0, 0)
                 flag = bool(rollout.terminated[row, t])
-                found.append((int(t), float(totals[k] - before[0]), int(counts[k] - before[1]), flag))
+                if rollout.mask[row, t]:
+                    found.append((int(t), float(totals[k] - before[0]), int(counts[k] - before[1]), flag))
             self._returns[row] -= totals[-1]
             self._lengths[row] -= counts[-1]
         return [episode[1:] for episode in sorted(found, key=lambda episode: episode[0])]
@@ -248,7 +291,7 @@ def to_batch(rollout: Rollout, engine: Any, normalisers: Normalisers, settings: 
     values = engine.values(flat).reshape(rollout.logp.shape)
     following, mask = next_values(values, rollout, engine), rollout.mask
     if isinstance(settings, ReinforceSettings) and not settings.baseline:
-        mask = mask & finished(rollout.ended)
+        mask = mask & finished(rollout.ended, mask)
         values, following = np.zeros_like(values), np.zeros_like(values)
     ends = (rollout.terminated, rollout.ended, mask)
     advantages = engine.gae(rewards, values, following, *ends, settings.gamma, settings.gae_lambda)
@@ -265,6 +308,12 @@ def to_batch(rollout: Rollout, engine: Any, normalisers: Normalisers, settings: 
     return Batch(inputs=inputs, **tensors)
 
 
-def finished(ended: Array) -> Array:
-    """True [B, T] for steps whose episode ends inside the rollout: some end at or after them."""
-    return np.logical_or.accumulate(ended[:, ::-1], axis=1)[:, ::-1]
+def finished(ended: Array, mask: Array) -> Array:
+    """True [B, T] for steps whose episode ends inside the rollout, and not in a fault that cut it (``ended``
+    where ``mask`` is False).
+    """
+    found, whole = np.zeros_like(ended), np.zeros(len(ended), bool)
+    for t in range(ended.shape[1] - 1, -1, -1):
+        whole = np.where(ended[:, t], mask[:, t], whole)
+        found[:, t] = whole
+    return found

@@ -8,11 +8,14 @@ from typing import Any, NamedTuple, final
 import gymnasium as gym
 import numpy as np
 
-from tightrope.control import states, tasks
-from tightrope.control.autoreset import VectorCopies, is_vector_env
+from tightrope.control import tasks
+from tightrope.control.autoreset import VectorCopies
+from tightrope.control.copies import EnvCopies
+from tightrope.control.faults import EnvironmentFault, FaultPolicy
+from tightrope.control.guard import GuardedVector, is_vector_env
+from tightrope.control.slots import Step
 from tightrope.control.spaces import Inputs
-from tightrope.control.vector import EnvironmentFault, Step
-from tightrope.control.workers import EnvCopies, available_cores
+from tightrope.control.workers import available_cores
 
 __all__ = [
     "Backend",
@@ -68,7 +71,7 @@ class Environments:
 
     def __init__(
         self,
-        copies: EnvCopies | VectorCopies,
+        copies: EnvCopies | GuardedVector,
         num_envs: int,
         *,
         backend: Backend,
@@ -85,6 +88,7 @@ class Environments:
         self.num_workers = backend.num_workers
         self.max_episode_steps = max_episode_steps
         self.squash = squash
+        self.restartable = copies.policy.restart
         self.waves = (
             copies.waves
         )  # rows in the order to act in: choosing the next overlaps with stepping the last
@@ -98,20 +102,15 @@ class Environments:
     @property
     def gives_state(self) -> bool:
         """Whether the copies can give their state (see states.py)."""
-        copies = self._copies
-        return states.gives_state(copies._env if isinstance(copies, VectorCopies) else copies._own.envs[0])
+        return self._copies.gives_state
 
-    def get_state(self) -> list[Any]:
+    def get_state(self) -> dict[str, Any]:
         """What the copies are in the middle of, as JSON can hold it; EnvironmentFault when it cannot."""
-        copies = self._copies
-        return copies.get_state() if isinstance(copies, VectorCopies) else states.of_copies(copies)
+        return self._copies.get_state()
 
-    def set_state(self, found: list[Any]) -> None:
-        """Go on from what `get_state` gave, after a reset."""
-        if isinstance(self._copies, VectorCopies):
-            self._copies.set_state(found)
-        else:
-            states.into_copies(self._copies, found)
+    def set_state(self, found: dict[str, Any]) -> None:
+        """Reset every copy, and go on from what `get_state` gave."""
+        self._copies.set_state(found)
 
     def step(self, actions: np.ndarray) -> Step:
         """Act in every copy; ``actions`` [B, A] float32 as sampled, bounds are taken care of here."""
@@ -126,6 +125,23 @@ class Environments:
     def finish(self) -> Step:
         """Step what has not begun and wait for the rest; every wave must have begun, in order."""
         return self._copies.finish()
+
+    @property
+    def restarts(self) -> int:
+        """How often an environment, or a process of them, was made anew after a fault."""
+        return self._copies.restarts
+
+    def count_from(self, restarts: int) -> None:
+        """Count restarts from ``restarts`` on: those of the run before it was gone on with."""
+        self._copies.count_from(restarts)
+
+    def worker_of(self, row: int) -> int:
+        """The worker process that steps a row; 0: this one."""
+        return self._copies.worker_of(row)
+
+    def seed_of(self, row: int) -> int:
+        """The seed of a row's last seeded reset."""
+        return self._copies.seed_of(row)
 
     def close(self) -> None:
         """Close every copy that was made here and end the workers."""
@@ -145,18 +161,19 @@ def make_environments(
     backend: str = "auto",
     num_workers: int | None = None,
     squash: bool = False,
+    policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
 ) -> Environments:
     """``num_envs`` copies of a Gymnasium id, an instance, a zero-argument factory, or a vector environment
     as it is.
 
     ``num_envs`` None: 1, or what the vector environment has. A given instance or vector environment is
-    stepped but never closed. ValueError: an unknown id, a backend the task does not have, an instance that
-    cannot be replicated, spaces that are not supported.
+    stepped but never closed. ``policy``: what a fault of theirs leads to. ValueError: an unknown id, a
+    backend the task does not have, an instance that cannot be replicated, spaces that are not supported.
     """
     if backend not in BACKENDS:
         raise ValueError(f"vector backend is {backend!r}; expected one of: {', '.join(BACKENDS)}.")
     if is_vector_env(env):
-        return _given(env, num_envs, backend, squash)
+        return _given(env, num_envs, backend, squash, policy)
     num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1:
         raise ValueError(f"num_envs is {num_envs}; expected at least 1.")
@@ -167,9 +184,9 @@ def make_environments(
             "vector environment."
         )
     chosen = _resolve(env, num_envs, backend, num_workers)
-    copies: EnvCopies | VectorCopies
+    copies: EnvCopies | GuardedVector
     if isinstance(env, str) and chosen.name in ("vector", "envpool"):
-        copies = _vector_copies(env, num_envs, chosen)
+        copies = _vector_copies(env, num_envs, chosen, policy)
         return _finish(copies, num_envs, chosen, env, tasks.find_spec(env), squash)
     makers: list[Callable[[], gym.Env]]
     if isinstance(env, str):
@@ -179,7 +196,7 @@ def make_environments(
     else:
         name, makers = getattr(env, "__name__", type(env).__name__), [env] * num_envs
     keep_first = isinstance(env, gym.Env)
-    copies = EnvCopies(makers, chosen.num_workers, name, keep_first=keep_first)
+    copies = EnvCopies(makers, chosen.num_workers, name, keep_first=keep_first, policy=policy)
     return _finish(
         copies, num_envs, chosen, name if isinstance(env, str) else copies.spec_id, copies.spec, squash
     )
@@ -208,17 +225,18 @@ def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> 
     )  # an instance may have been made otherwise
 
 
-def _vector_copies(env_id: str, num_envs: int, chosen: Backend) -> VectorCopies:
+def _vector_copies(env_id: str, num_envs: int, chosen: Backend, policy: FaultPolicy) -> GuardedVector:
+    make: Callable[[int], Any]
     if chosen.name == "vector":
-        vector = tasks.make_vector_by_id(env_id, num_envs)
-        return VectorCopies(lambda seed: vector, env_id)
+        make = lambda seed: tasks.make_vector_by_id(env_id, num_envs)  # noqa: E731
+        vector = make(0)
+        return GuardedVector(VectorCopies(lambda seed: vector, env_id), policy, make)
     threads = min(num_envs, available_cores())
-    return VectorCopies(
-        lambda seed: tasks.make_envpool(env_id, num_envs, seed, threads), env_id, int32_actions=True
-    )
+    make = lambda seed: tasks.make_envpool(env_id, num_envs, seed, threads)  # noqa: E731
+    return GuardedVector(VectorCopies(make, env_id, int32_actions=True), policy, make)
 
 
-def _given(env: Any, num_envs: int | None, backend: str, squash: bool) -> Environments:
+def _given(env: Any, num_envs: int | None, backend: str, squash: bool, policy: FaultPolicy) -> Environments:
     """A vector environment of the user's own."""
     if num_envs not in (None, int(env.num_envs)):
         raise ValueError(
@@ -229,7 +247,9 @@ def _given(env: Any, num_envs: int | None, backend: str, squash: bool) -> Enviro
             f"vector backend {backend!r} asked for, but a vector environment was given. Use auto."
         )
     envpool = not isinstance(env, gym.vector.VectorEnv)
-    copies = VectorCopies(lambda seed: env, _name(env), keep=True, int32_actions=envpool)
+    copies = GuardedVector(
+        VectorCopies(lambda seed: env, _name(env), keep=True, int32_actions=envpool), policy
+    )
     spec = getattr(env, "spec", None)
     return _finish(copies, int(env.num_envs), Backend("given", 1), _name(env), spec, squash)
 
@@ -240,7 +260,7 @@ def _name(env: Any) -> str:
 
 
 def _finish(
-    copies: EnvCopies | VectorCopies, num_envs: int, backend: Backend, spec_id: str, spec: Any, squash: bool
+    copies: EnvCopies | GuardedVector, num_envs: int, backend: Backend, spec_id: str, spec: Any, squash: bool
 ) -> Environments:
     if squash:
         try:

@@ -10,6 +10,7 @@ import numpy as np
 
 from tightrope.control import tasks
 from tightrope.control.environments import Environments, make_environments
+from tightrope.control.faults import policy_of
 
 Array = np.ndarray
 EVALUATION_SEED = 1_000_003  # far from training's seeds, which start at settings.seed
@@ -40,6 +41,11 @@ def evaluate_agent(
         actions = act(agent, inputs, action_mask, None if deterministic else rng)
         step = environments.step(actions)
         real = np.ones(rows, bool) if step.phantom is None else ~step.phantom
+        if (
+            step.cut is not None
+        ):  # an episode that a fault cut counts for nothing; another one takes its place
+            real &= ~step.cut
+            totals[step.cut], lengths[step.cut] = 0.0, 0
         totals += np.where(real, step.rewards, 0.0)
         lengths += real
         for row in np.flatnonzero((step.terminated | step.truncated) & real):
@@ -92,7 +98,13 @@ def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environme
     backend = settings.vector_backend if settings.vector_backend in ("vector", "envpool") else "serial"
     if hasattr(source, "observation_space"):  # an instance trains already: evaluation needs copies, not it
         source = tasks.replicas(source, 2)[1]
-    return make_environments(source, min(episodes, MAX_COPIES), backend=backend, squash=settings.squash)
+    return make_environments(
+        source,
+        min(episodes, MAX_COPIES),
+        backend=backend,
+        squash=settings.squash,
+        policy=policy_of(settings),
+    )
 
 
 def evaluate_run(

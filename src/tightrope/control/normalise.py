@@ -77,7 +77,7 @@ class RewardNormaliser:
         for t in range(rewards.shape[1]):
             stepped = self.running * self.gamma + rewards[:, t]
             series[:, t] = stepped
-            self.running = np.where(mask[:, t], np.where(ended[:, t], 0.0, stepped), self.running)
+            self.running = np.where(ended[:, t], 0.0, np.where(mask[:, t], stepped, self.running))
         self.moments = self.moments.update(torch.from_numpy(series[mask][:, None]))
 
     def restart(self, num_envs: int) -> None:

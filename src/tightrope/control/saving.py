@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
@@ -13,6 +14,7 @@ from tightrope.control.agent import AGENTS, Agent, anywhere
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
+from tightrope.runs.history import Checkpoint
 
 
 def save_agent(agent: Agent, folder: Path) -> Path:
@@ -30,6 +32,8 @@ def snapshot(agent: Agent) -> tuple[dict[str, dict[str, torch.Tensor]], dict[str
         "settings": settings_to_json(agent.settings),
         "steps": agent.steps,
         "kl_beta": agent.kl_beta,
+        "rollbacks": agent.rollbacks,
+        "environment_restarts": agent.environments.restarts,
         "own_policy": agent.policy.own is not None,
         "own_environment": agent.env is not None and not isinstance(agent.env, str),
         "rng": {
@@ -121,6 +125,8 @@ def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: di
         normalisers["rewards.running"] = torch.zeros(agent.environments.num_envs, dtype=torch.float64)
     agent.normalisers.load(normalisers)
     agent.steps, agent.kl_beta = int(state["steps"]), state["kl_beta"]
+    agent.rollbacks = int(state.get("rollbacks", 0))  # none in a run begun before they were
+    agent.collector.count_from(int(state.get("environment_restarts", 0)))
     agent.sampling_rng.bit_generator.state = state["rng"]["sampling"]
     agent.update_rng.bit_generator.state = state["rng"]["update"]
 
@@ -133,7 +139,7 @@ def resume_episodes(agent: Agent, state: dict[str, Any]) -> list[str]:
     if not agent.steps:
         return []
     if episodes is not None and agent.environments.gives_state:
-        agent.collector.restore(seed, agent.steps, episodes)
+        agent.collector.restore(episodes)
         agent.fresh = False
         return []
     what = f"{agent.environments.num_envs} environments begin anew at step {agent.steps:,}"
@@ -142,3 +148,19 @@ def resume_episodes(agent: Agent, state: dict[str, Any]) -> list[str]:
             f"warning: {what}: the run's could give their state, these cannot, so that the end may differ."
         ]
     return [f"{what}, with seeds of (seed {seed}, step), as on every point of the checkpoint grid."]
+
+
+def roll_back(agent: Agent, point: Checkpoint) -> int:
+    """Put the agent back to a checkpoint of its own, with random generators on a stream that is a function of
+    the seed, the step and the number of rollbacks; returns the step. Environments are as after `resume`;
+    their restarts stay counted.
+    """
+    rollbacks, restarts = agent.rollbacks + 1, agent.environments.restarts
+    restore(agent, point.tensors, point.state)
+    agent.rollbacks, agent.fresh = rollbacks, True
+    agent.collector.count_from(restarts)
+    resume_episodes(agent, point.state)
+    for k, rng in ((1, agent.sampling_rng), (2, agent.update_rng)):
+        other = np.random.default_rng([agent.settings.seed, k, agent.steps, rollbacks])
+        rng.bit_generator.state = other.bit_generator.state
+    return agent.steps

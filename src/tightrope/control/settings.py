@@ -91,6 +91,21 @@ class TrainSettings:
     )
     compile: bool = setting(False, "Torch path: compile the model with torch.compile.")
 
+    on_env_fault: str = setting(
+        "raise",
+        "When an environment raises, hangs, dies or gives NaN: end the run, or make it anew and go on.",
+        choices=("raise", "restart"),
+    )
+    max_env_restarts: int = setting(
+        10,
+        "With on_env_fault restart: environments made anew at most, in all; then the run ends.",
+        at_least=1,
+    )
+    env_timeout: float | None = setting(
+        60.0, "Seconds a step or a reset of an environment may take before it counts as hung; none: any.",
+        above=0,
+    )  # fmt: skip
+
     evaluate_every: float | None = setting(
         0.05,
         "Fraction of the run between evaluations; none: no evaluation while training.",
@@ -108,6 +123,11 @@ class TrainSettings:
     )
     keep_checkpoints: int | None = setting(
         3, "Checkpoints that are kept, the newest ones; the best policy always is. none: all.", at_least=2
+    )
+    max_rollbacks: int = setting(
+        0,
+        "After a NaN or an infinity: go back to the newest checkpoint this often; 0: end the run.",
+        at_least=0,
     )
     tensorboard: bool = setting(False, "Also write TensorBoard event files into the run folder.")
 

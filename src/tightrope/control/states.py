@@ -14,6 +14,7 @@ import json
 import math
 import socket
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -129,27 +130,27 @@ def put_back(env: Any, packed: Any) -> None:
 # ------------------------------------------------------------------------------- copies, here and in workers
 
 
-def of_copies(copies: Any) -> list[Any]:
-    """The packed states of all copies of an EnvCopies, in order; EnvironmentFault names one that cannot."""
-    for worker in copies._workers:
+def of_copies(own: Any, workers: Sequence[Any]) -> list[Any]:
+    """The packed states of the copies of this process (None: it has none) and of its workers, in order;
+    EnvironmentFault names one that cannot.
+    """
+    for worker in workers:
         worker.tell(b"g")
-    found = copies._own.get_state()
-    for worker in copies._workers:
+    found = [] if own is None else own.get_state()
+    for worker in workers:
         worker.wait()
-        (length,) = LENGTH.unpack(worker._receive(LENGTH.size))
-        found += json.loads(worker._receive(length))
+        found += worker.data()
     return found
 
 
-def into_copies(copies: Any, found: list[Any]) -> None:
-    """Give every copy of an EnvCopies, which has been reset, its state of `of_copies`."""
-    first = len(copies._own.envs)
-    copies._own.set_state(found[:first])
-    bounds = [worker.first for worker in copies._workers] + [len(found)]
-    for worker, (begin, end) in zip(copies._workers, itertools.pairwise(bounds), strict=True):
+def into_copies(found: list[Any], own: Any, workers: Sequence[Any]) -> None:
+    """Give every copy, which has been reset, its state of `of_copies`."""
+    bounds = [worker.first for worker in workers] + [len(found)]
+    if own is not None:
+        own.set_state(found[: bounds[0]])
+    for worker, (begin, end) in zip(workers, itertools.pairwise(bounds), strict=True):
         data = json.dumps(found[begin:end], allow_nan=False).encode()
-        worker.tell(b"p", len(data))
-        worker._socket.sendall(data)
+        worker.tell(b"p", len(data), data)
         worker.wait()
 
 

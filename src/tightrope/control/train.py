@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.agent import AGENTS, Agent, Progress
 from tightrope.control.evaluate import EVALUATION_SEED, evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
-from tightrope.control.saving import rebuild, restore, resume_episodes, save_agent, snapshot
+from tightrope.control.saving import rebuild, restore, resume_episodes, roll_back, save_agent, snapshot
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import signals
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.grid import crosses
 from tightrope.runs.history import steps_in
+from tightrope.runs.rollback import rolling_back
 from tightrope.runs.run import Run, teller
 
 __all__ = ["resolve", "resume", "train"]
@@ -111,12 +112,13 @@ def _continue(
     report("start", _start(agent, run))
     try:
         with signals.stoppable():
-            clock, before = time.perf_counter(), begin
-            for progress in agent.iterate(total_steps, start=0):
+            clock = time.perf_counter()
+            for progress in _updates(agent, run, total_steps, report):
                 wall += time.perf_counter() - clock
                 signals.check()
                 step, metrics = agent.steps, {**progress.metrics, "time/seconds": wall}
-                if crosses(before, min(step, total_steps - 1), total_steps, settings.evaluate_every):
+                last = min(step, total_steps - 1)
+                if crosses(progress.before, last, total_steps, settings.evaluate_every):
                     metrics |= evaluator.evaluate()
                 run.record_episodes(
                     {"step": step, "return": r, "length": n, "terminated": t} for r, n, t in progress.episodes
@@ -125,11 +127,9 @@ def _continue(
                 report(
                     "update", {"step": step, "total_steps": total_steps, "metrics": metrics, "seconds": wall}
                 )
-                if (
-                    progress.on_grid and step + settings.num_envs <= total_steps
-                ):  # the end has a save of its own
+                if progress.on_grid and step + settings.num_envs <= total_steps:  # the end has its own save
                     _save(agent, run, evaluator.best, wall, report)
-                clock, before = time.perf_counter(), step
+                clock = time.perf_counter()
             final = evaluator.evaluate()
             _save(agent, run, evaluator.best, wall, report, final=True)
     finally:
@@ -140,6 +140,22 @@ def _continue(
     run.finish(summary)
     report("finish", summary)
     return summary
+
+
+def _updates(agent: Agent, run: Run, total_steps: int, report: Reporter) -> Iterator[Progress]:
+    """The agent's updates; after a NaN or an infinity, from the newest checkpoint on, as often as allowed."""
+    updates = rolling_back(
+        lambda: agent.iterate(total_steps, start=0),
+        run,
+        lambda point: roll_back(agent, point),
+        teller(report),
+        taken=agent.rollbacks,
+        limit=agent.settings.max_rollbacks,
+    )
+    for progress in updates:
+        if agent.rollbacks:
+            progress.metrics["train/rollbacks"] = float(agent.rollbacks)
+        yield progress
 
 
 def _start(agent: Agent, run: Run) -> dict[str, Any]:
@@ -186,6 +202,7 @@ class _Evaluator:
     def evaluate(self) -> dict[str, float]:
         if self.environments is None:
             return {}
+        self.environments.count_from(0)  # what a resumed run has not seen must not end it sooner or later
         if self.first_state is not None:
             self.environments.set_state(self.first_state)
         result = evaluate_agent(self.agent, self.environments, self.agent.settings.evaluation_episodes)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tightrope.algorithms.batch import Batch
 from tightrope.language.data import Prompt, pad_left
+from tightrope.language.faults import advising_on_memory
 from tightrope.language.kl import kl_rewards
 from tightrope.language.policy_model import Said, length_groups
 from tightrope.language.rewards import Scores
@@ -75,13 +76,15 @@ class PromptOrder:
         return taken
 
 
+@advising_on_memory
 def gather(
     roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int, *, keep: bool = False
 ) -> Experience:
     """``samples`` responses to each prompt, and what policy, reference and critic say of them.
 
     No gradients; with ``keep``, and where responses of about one length need no groups, what is said keeps
-    its own for an update whose first pass is over all rows: that would say the same again.
+    its own for an update whose first pass is over all rows: that would say the same again. OutOfMemory, with
+    advice, when memory runs out without ``keep`` as well.
     """
     settings = roles.settings
     begin = time.perf_counter()

@@ -302,3 +302,19 @@ def _pad(rows: Sequence[Sequence[int]], filler: int, *, left: bool) -> tuple[Ten
         tokens[i, place] = torch.tensor(row, dtype=torch.int64)
         real[i, place] = True
     return tokens, real
+
+
+def hold_out(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prompt]]:
+    """Prompts to train on and ``count`` (a quarter at most) that never are, not even as equals of themselves.
+
+    ValueError when there are too few different ones.
+    """
+    distinct = list({prompt.tokens: prompt for prompt in prompts}.values())
+    held = distinct[len(distinct) - min(count, len(distinct) // 4) :]
+    if not held:
+        raise ValueError(
+            f"There are {len(distinct)} different prompts; a gold score on held-out ones needs at least 4. "
+            "Give more, or no gold."
+        )
+    kept = {prompt.tokens for prompt in held}
+    return [prompt for prompt in prompts if prompt.tokens not in kept], held

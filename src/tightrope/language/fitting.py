@@ -20,6 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tightrope.algorithms.memory import Parts
+from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam, Brake, Meter
 from tightrope.algorithms.settings import scheduled
 from tightrope.language import lora
@@ -223,7 +225,8 @@ def fit(
     brake, items = Brake(parameters[0].device), objective.items
     each = math.ceil(len(items) / settings.minibatch_size)
     total = each * settings.num_epochs
-    now, saved = load_progress(run, Progress(objective.name, len(items)), teller(report))
+    fresh = Progress(objective.name, len(items), micro_batch_size=settings.micro_batch_size)
+    now, saved = load_progress(run, fresh, teller(report))
     if saved is not None:
         put_back(saved.tensors, parameters, optimiser)
     run.rewind(saved)  # without a checkpoint what stands at step 0 is recorded again
@@ -238,9 +241,10 @@ def fit(
         clock = time.perf_counter()
         rate = scheduled(settings.learning_rate, settings.learning_rate_schedule, now.step / total)
         optimiser.param_groups[0]["lr"] = rate
-        metrics = take_step(objective, minibatch, optimiser, brake, settings)
-        metrics[f"{objective.steps}/learning_rate"] = rate or 0.0
-        now.step += 1
+        parts = Parts(now.micro_batch_size)
+        metrics = take_step(objective, minibatch, optimiser, brake, settings, parts)
+        metrics |= {f"{objective.steps}/learning_rate": rate or 0.0, **parts.metrics()}
+        now.step, now.micro_batch_size = now.step + 1, parts.size
         now.seen += sum(objective.count(item) for item in minibatch)
         if objective.seen is not None:
             metrics[objective.seen] = float(now.seen)
@@ -273,18 +277,29 @@ def take_step(
     optimiser: torch.optim.Optimizer,
     brake: Brake,
     settings: SupervisedSettings,
+    parts: Parts | None = None,
 ) -> dict[str, float]:
-    """One optimiser step on the mean over all terms of the minibatch, however it is split."""
-    meter, sums = Meter(), dict[str, Tensor]()
+    """One optimiser step on the mean over all terms of the minibatch, however it is split; ``parts`` knows
+    from the steps before what fits into memory.
+    """
+    parts = parts or Parts(settings.micro_batch_size)
+    meter = Meter()
     count = sum(objective.count(item) for item in minibatch)
-    optimiser.zero_grad(set_to_none=True)
-    for part in micro_batches(minibatch, settings.micro_batch_size, objective.length):
-        loss, figures = objective.loss(part)
-        (loss / count).backward()
-        for name, x in {"loss": loss.detach(), **figures}.items():
-            sums[name] = sums[name] + x if name in sums else x
+
+    def gradient(size: int | None) -> dict[str, Tensor]:
+        sums = dict[str, Tensor]()
+        optimiser.zero_grad(set_to_none=True)
+        for part in micro_batches(minibatch, size, objective.length):
+            loss, figures = objective.loss(part)
+            (loss / count).backward()
+            for name, x in {"loss": loss.detach(), **figures}.items():
+                sums[name] = sums[name] + x if name in sums else x
+        return sums
+
+    sums = parts.fitting(len(minibatch), gradient, optimiser)
+    brake.bad = brake.bad | ~torch.isfinite(sums["loss"])
     brake.step(optimiser, settings.max_grad_norm, meter)
-    brake.halted(poll=True)
+    brake.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
     metrics = {f"{objective.name}/{name}": float(x) / count for name, x in sums.items()}
     metrics[f"{objective.steps}/grad_norm"] = meter.means()["train/grad_norm"]
     return metrics

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -30,8 +32,8 @@ class PolicyModel:
 
     def __call__(self, part: Batch) -> Evaluation:
         """Log-probabilities and entropies of the policy, and the critic's values, where the mask is True."""
-        if self.said is not None:
-            said, self.said = self.said, None
+        said, self.said, self.kl = self.said, None, None  # memory ran out: nothing of the pass before is kept
+        if said is not None:
             logp, entropy, self.kl, values = (x[part.inputs["row"]] for x in said)
             return Evaluation(logp, entropy, values)
         groups = length_groups(part.inputs["real"], part.mask)
@@ -42,6 +44,10 @@ class PolicyModel:
         found = zip(*(self._rows(part.select(rows)) for rows in groups), strict=True)
         logp, entropy, self.kl, values = (torch.cat(pieces)[back] for pieces in found)
         return Evaluation(logp, entropy, values)
+
+    def named_parameters(self) -> Iterator[tuple[str, Tensor]]:
+        """Everything that may be trained, by name: for messages."""
+        return self.roles.named_parameters()
 
     def _rows(self, part: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Log-probabilities, entropies, KL to the reference and values of some rows, each [b, R]."""

@@ -57,7 +57,8 @@ class Scores:
     ``total`` [B] float64: sum over functions of weight times score, NaN where not ``valid`` [B] bool, so that
     a forgotten mask cannot pass for a score. ``parts``: each function's own scores [B], before its weight,
     NaN where it does not apply or failed. ``metrics``, under declared names: the mean of each part
-    (``scores/NAME``) and what log_metric got (``logged/NAME``). ``extras``:
+    (``scores/NAME``), what log_metric got (``logged/NAME``), and how many samples a function failed to score
+    (``rewards/NAME/errors``, ``rewards/NAME/timeouts``; absent: none). ``extras``:
     columns of B entries from log_extra. ``faults``: why samples are masked, one a function and kind.
     """
 
@@ -179,6 +180,8 @@ class Rewards:
             part, found = self._judged(name, weight, answer, completions)
             for fault in found:
                 broken[list(fault.samples)] = True
+                counter = f"rewards/{name}/{'timeouts' if fault.kind == 'timeout' else 'errors'}"
+                metrics[counter] = metrics.get(counter, 0.0) + len(fault.samples)
             faults += found
             scored = ~np.isnan(part)
             total[scored] += weight * part[scored]

@@ -9,7 +9,7 @@ reward     adapter "reward" and a head | a model of its own | a function of the 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from tightrope.language.models import (
     find_model,
     load_causal,
     load_tokenizer,
+    parameter_counts,
     parts,
     require_device,
 )
@@ -94,6 +95,28 @@ class Roles:
         elif self.settings.critic == "adapter":
             found += lora.adapter_parameters(self.model, "critic")
         return found
+
+    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """Every weight of the policy's model and of the critic, by name."""
+        yield from self.model.named_parameters()
+        if self.critic_head is not None:
+            yield from self.critic_head.named_parameters("critic_head")
+        if self.critic is not None:
+            yield from self.critic.parts.base.named_parameters("critic")
+
+    def lines(self) -> list[str]:
+        """What is trained, in lines to show where a run begins."""
+        settings, trunk = self.settings, self.trunk
+        trained, total = parameter_counts(self.model, self.parameters())
+        shared = (
+            f"; {trunk.cut} of {len(trunk.parts.layers)} layers computed once for all roles"
+            if trunk.cut
+            else ""
+        )
+        return [
+            f"policy: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained{shared}",
+            f"critic: {settings.critic}; KL: {settings.kl}, kl_beta {settings.kl_beta:g}",
+        ]
 
     def parameters(self) -> list[nn.Parameter]:
         """Everything that is trained: the policy's weights or adapter, then the critic's."""

@@ -5,13 +5,15 @@ which the run goes on.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -23,6 +25,7 @@ from tightrope.language.roles import Roles
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.durable import whole
 from tightrope.runs.history import Checkpoint, steps_in
+from tightrope.runs.rollback import rolling_back
 from tightrope.runs.run import Run, teller
 
 if TYPE_CHECKING:
@@ -82,6 +85,8 @@ def save_state(trainer: Trainer, run: Run, *, final: bool = False) -> None:
         "episodes": trainer.episodes,
         "iteration": trainer.iteration,
         "kl_beta": trainer.kl_beta,
+        "rollbacks": trainer.rollbacks,
+        "micro_batch_size": trainer.micro_batch_size,
         "prompt_position": trainer.order.position,
         "prompts_sha256": _hash_of([*trainer.prompts, *trainer.held_out]),
         "rng": {"update": trainer.update_rng.bit_generator.state},
@@ -109,7 +114,8 @@ def restore_state(trainer: Trainer, point: Checkpoint) -> None:
         )
     put_back(tensors, trainer.roles.parameters(), trainer.optimiser)
     trainer.episodes, trainer.iteration = int(state["episodes"]), int(state["iteration"])
-    trainer.kl_beta = float(state["kl_beta"])
+    trainer.kl_beta, trainer.rollbacks = float(state["kl_beta"]), int(state.get("rollbacks", 0))
+    trainer.micro_batch_size = state.get("micro_batch_size", trainer.micro_batch_size)
     trainer.order.position = int(state["prompt_position"])
     trainer.update_rng.bit_generator.state = state["rng"]["update"]
     trainer.monitor.restore(state["monitor"])
@@ -119,10 +125,30 @@ def restore_state(trainer: Trainer, point: Checkpoint) -> None:
         trainer.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 
 
+def roll_back(trainer: Trainer, point: Checkpoint) -> int:
+    """Put a trainer back to a checkpoint of its own; what is drawn from there on is a function of the seed,
+    the episode and the number of rollbacks. Returns the episode. What fits into memory stays known.
+    """
+    rollbacks, size = trainer.rollbacks + 1, trainer.micro_batch_size
+    restore_state(trainer, point)
+    trainer.rollbacks, trainer.micro_batch_size = rollbacks, size
+    other = np.random.default_rng([trainer.settings.seed, 9, trainer.episodes, rollbacks])
+    trainer.update_rng.bit_generator.state = other.bit_generator.state
+    return trainer.episodes
+
+
+def updates(trainer: Trainer, run: Run) -> Iterator[tuple[dict[str, float], list[dict[str, Any]]]]:
+    """`Trainer.iterate`; after a NaN or an infinity, from the newest checkpoint on, so often and no more."""
+    back, tell = functools.partial(roll_back, trainer), teller(trainer.report)
+    limit = trainer.settings.max_rollbacks
+    return rolling_back(trainer.iterate, run, back, tell, taken=trainer.rollbacks, limit=limit)
+
+
 @dataclass
 class Progress:
     """Where supervised training stands: ``step`` optimiser steps of ``story`` (sft, reward) on ``items``
-    examples, ``seen`` terms learnt from, ``seconds``, and the newest value of every metric.
+    examples, ``seen`` terms learnt from, ``seconds``, the newest value of every metric, and the micro-batch
+    that fits into memory.
     """
 
     story: str
@@ -131,6 +157,7 @@ class Progress:
     seen: int = 0
     seconds: float = 0.0
     newest: dict[str, float] = dataclasses.field(default_factory=dict)
+    micro_batch_size: int | None = None
 
 
 def save_progress(run: Run, progress: Progress, tensors: Tensors, **how: Any) -> None:

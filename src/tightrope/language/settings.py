@@ -172,6 +172,11 @@ class AlignSettings(ModelSettings):
     reward_timeout: float | None = setting(
         60.0, "Seconds a reward function may take; its samples are left out then. none: forever.", above=0
     )
+    max_rollbacks: int = setting(
+        0,
+        "After a NaN or an infinity: go back to the newest checkpoint this often; 0: end the run.",
+        at_least=0,
+    )
     evaluate_every: float | None = setting(
         0.05, "Fraction of the run between gold scores on held-out prompts.", above=0, at_most=1
     )

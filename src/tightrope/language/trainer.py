@@ -19,6 +19,7 @@ from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.algorithms.optimise import SamplingMismatch, make_optimiser, set_learning_rates
 from tightrope.language.collect import (
+    Experience,
     PromptOrder,
     comparable,
     describe,
@@ -27,17 +28,18 @@ from tightrope.language.collect import (
     rewards_of,
     to_batch,
 )
-from tightrope.language.data import Prompt, read_prompts, read_rows
+from tightrope.language.data import Prompt, hold_out, read_prompts, read_rows
+from tightrope.language.faults import refuse_bad_numbers
 from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
-from tightrope.language.models import context_length, find_model, parameter_counts
+from tightrope.language.models import context_length, find_model
 from tightrope.language.monitor import Monitor
-from tightrope.language.policy_model import PolicyModel, Said
+from tightrope.language.policy_model import PolicyModel
 from tightrope.language.ptx import Pretraining
 from tightrope.language.roles import Roles, make_roles
 from tightrope.language.samples import sample_rows
 from tightrope.language.sampling import log_ratio_limit
-from tightrope.language.saving import save_model, save_state
+from tightrope.language.saving import save_model, save_state, updates
 from tightrope.language.scoring import (
     Judge,
     critic_from_reward,
@@ -102,7 +104,8 @@ class Trainer:
         self.pretraining = Pretraining.make(settings, self.roles, self._warn) if settings.ptx_weight else None
         self.monitor = Monitor(kl_budget=settings.kl_budget)
         self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
-        self.seconds, self.newest = 0.0, dict[str, float]()
+        self.seconds, self.rollbacks, self.newest = 0.0, 0, dict[str, float]()
+        self.micro_batch_size = settings.update.micro_batch_size  # halved when memory runs out
         self._told = set[tuple[str, str]]()
 
     def _read_prompts(self, source: Any) -> list[Prompt]:
@@ -127,10 +130,10 @@ class Trainer:
         """Train until the budget is spent; the run folder then holds everything."""
         settings = self.settings
         total = {"total_steps": settings.total_episodes}
-        facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self._lines()}
+        facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self.roles.lines()}
         self.report("start", {"settings": dataclasses.asdict(settings), **facts, **total})
         with run, signals.stoppable():
-            for metrics, rows in self.iterate():
+            for metrics, rows in updates(self, run):
                 signals.check()
                 self.newest = metrics
                 run.record(self.episodes, metrics["time/seconds"], metrics)
@@ -184,19 +187,6 @@ class Trainer:
             "final": {name: value for name, value in metrics.items() if name.startswith(shown)},
         }
 
-    def _lines(self) -> list[str]:
-        settings, trunk = self.settings, self.roles.trunk
-        trained, total = parameter_counts(self.roles.model, self.roles.parameters())
-        shared = (
-            f"; {trunk.cut} of {len(trunk.parts.layers)} layers computed once for all roles"
-            if trunk.cut
-            else ""
-        )
-        return [
-            f"policy: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained{shared}",
-            f"critic: {settings.critic}; KL: {settings.kl}, kl_beta {settings.kl_beta:g}",
-        ]
-
     def iterate(self) -> Iterator[tuple[dict[str, float], list[dict[str, Any]]]]:
         """One iteration at a time: its metrics, and its rows for samples.jsonl."""
         while count := self._next_prompts():
@@ -207,9 +197,13 @@ class Trainer:
         settings, begin = self.settings, time.perf_counter()
         present = settings.update.at(self.episodes / settings.total_episodes)
         set_learning_rates(self.optimiser, present)
-        stream = (settings.seed, self.iteration, settings.samples_per_prompt)
-        keep = settings.one_pass and self.iteration >= settings.critic_warmup
-        experience = gather(self.roles, prompts, *stream, keep=keep)
+        stream = settings.seed + 2**40 * self.rollbacks  # not the numbers that led to a NaN
+        keep = (
+            settings.one_pass and self.micro_batch_size is None and self.iteration >= settings.critic_warmup
+        )
+        given = (stream, self.iteration, settings.samples_per_prompt)
+        experience = gather(self.roles, prompts, *given, keep=keep)
+        refuse_bad_numbers(experience, self.roles)
         gathered = time.perf_counter()
         asked = [prompt for prompt in prompts for _ in range(settings.samples_per_prompt)]
         scores = self.judge(asked, experience, self._trainer_state())
@@ -228,11 +222,13 @@ class Trainer:
         self._watch(metrics)
         judged = time.perf_counter()
         if len(batch) and not self.stopped:
-            metrics |= self._update(batch, present, experience.said)
+            metrics |= self._update(batch, present, experience)
             if settings.critic != "none":
                 metrics["train/explained_variance"] = float(
                     explained_variance(batch.old_values, batch.returns, batch.mask)
                 )
+        if self.rollbacks:
+            metrics["train/rollbacks"] = float(self.rollbacks)
         metrics["objective/kl_beta"] = self.kl_beta
         metrics["train/learning_rate"] = present.learning_rate
         metrics["time/score_seconds"] = scored - gathered
@@ -246,15 +242,15 @@ class Trainer:
         self.seconds += seconds
         metrics["time/seconds"] = self.seconds
         metrics["time/fps"] = float(experience.responses.mask.sum()) / seconds
-        return metrics, sample_rows(
-            self.roles.tokenizer, asked, experience, scores, batch, valid, self.episodes
-        )
+        told = (asked, experience, scores, batch, valid, self.episodes)
+        return metrics, sample_rows(self.roles.tokenizer, *told)
 
-    def _update(self, batch: Batch, present: Any, said: Said | None) -> dict[str, float]:
+    def _update(self, batch: Batch, present: Any, experience: Experience) -> dict[str, float]:
         """PPO, or the critic alone while it warms up."""
         warming = self.iteration < self.settings.critic_warmup
         exact = self.settings.exact_in_loss
-        model = PolicyModel(self.roles, exact=exact, critic_alone=warming, said=said)
+        model = PolicyModel(self.roles, exact=exact, critic_alone=warming, said=experience.said)
+        experience.said = None  # where memory runs out, nothing may hold on to a pass that is begun anew
         if warming:
             batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
             present = present.unchecked(entropy_weight=0.0, target_kl=None)
@@ -266,9 +262,17 @@ class Trainer:
             batch = dataclasses.replace(batch, advantages=advantages)
             kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
         extra = None if warming else self._extra_loss(kl_weight)
-        return ppo.update(
+        present = present.unchecked(micro_batch_size=self.micro_batch_size)
+        metrics = ppo.update(
             model, self.optimiser, batch, present, self.update_rng, extra_loss=extra, log_ratio_limit=limit
         )
+        if "train/micro_batch_size" in metrics:
+            self.micro_batch_size = int(metrics["train/micro_batch_size"])
+            self._warn(
+                f"memory ran out; from now on {self.micro_batch_size} responses a pass, the gradient is the "
+                f"same. Say --micro-batch-size {self.micro_batch_size} to begin with it."
+            )
+        return metrics
 
     def _extra_loss(self, kl_weight: float) -> Any:
         """The KL's share in the loss and the pretraining loss; None when neither is asked for."""
@@ -331,19 +335,3 @@ class Trainer:
             found.append(scores.total[scores.valid])
         judged = np.concatenate(found)
         return float(judged.mean()) if len(judged) else float("nan")
-
-
-def hold_out(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prompt]]:
-    """Prompts to train on and ``count`` (a quarter at most) that never are, not even as equals of themselves.
-
-    ValueError when there are too few different ones.
-    """
-    distinct = list({prompt.tokens: prompt for prompt in prompts}.values())
-    held = distinct[len(distinct) - min(count, len(distinct) // 4) :]
-    if not held:
-        raise ValueError(
-            f"There are {len(distinct)} different prompts; a gold score on held-out ones needs at least 4. "
-            "Give more, or no gold."
-        )
-    kept = {prompt.tokens for prompt in held}
-    return [prompt for prompt in prompts if prompt.tokens not in kept], held

@@ -26,6 +26,14 @@ _TABLE = (
         "Mean length of the training episodes that ended in this rollout.",
     ),
     metric("rollout/episodes", "episodes", "any", "Episodes that ended in this rollout."),
+    metric(
+        "rollout/environment_restarts",
+        "restarts",
+        "down",
+        "Environments, or processes of them, made anew after a fault in this rollout; with on_env_fault "
+        "restart alone.",
+        high=0.0,
+    ),
     metric("time/fps", "steps/s", "up", "Agent steps per second of this update."),
     metric("time/seconds", "s", "any", "Seconds of training so far; evaluations and saving are not counted."),
     metric("time/env_seconds", "s", "down", "Seconds of this update that the environments took."),
@@ -132,6 +140,26 @@ _TABLE = (
         low=0.0,
         high=1e-5,
     ),
+    metric(
+        "train/micro_batch_size",
+        "rows",
+        "any",
+        "Rows per forward pass after memory ran out in this update; the gradient is the same.",
+    ),
+    metric(
+        "train/memory_halvings",
+        "halvings",
+        "down",
+        "How often memory ran out in this update and the micro-batches were halved; absent: never.",
+        high=0.0,
+    ),
+    metric(
+        "train/rollbacks",
+        "rollbacks",
+        "down",
+        "How often the run went back to a checkpoint after a NaN or an infinity; absent: never.",
+        high=0.0,
+    ),
     metric("train/minibatches", "steps", "any", "Optimiser steps of this update; fewer after a KL stop."),
     metric("eval/mean_reward", "reward", "up", "Mean return of the evaluation episodes.", negative=True),
     metric("eval/std_reward", "reward", "any", "Standard deviation of the evaluation episodes' returns."),
@@ -151,6 +179,14 @@ FAMILIES: dict[str, Metric] = {
             "any",
             "Mean score of the reward function of this name, over the responses that it applies to.",
             negative=True,
+        ),
+        metric(
+            "rewards/",
+            "responses",
+            "down",
+            "Responses that the reward function of this name failed to score, as NAME/errors (it raised, or "
+            "gave something that is no score) and NAME/timeouts; they are masked. Absent: none.",
+            high=0.0,
         ),
         metric(
             "logged/",

@@ -14,7 +14,8 @@ import torch
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
-from tightrope.algorithms.optimise import NonFiniteError, SamplingMismatch
+from tightrope.algorithms.nonfinite import NonFiniteError
+from tightrope.algorithms.optimise import SamplingMismatch
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.control.engine import compiled, diagnose, plan
 

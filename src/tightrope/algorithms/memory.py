@@ -1,0 +1,97 @@
+"""Gradients in parts that fit into memory: after an out-of-memory error the parts are halved, the gradient is
+the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tightrope.algorithms.batch import Batch
+
+SIGNS = ("out of memory", "not enough memory", "defaultcpuallocator")  # what torch's RuntimeErrors say
+
+
+class OutOfMemory(RuntimeError):
+    """Memory is not enough even for the smallest part; the message says which setting makes it smaller."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether torch, on any device, or Python could not get the memory it asked for."""
+    if isinstance(error, torch.OutOfMemoryError | MemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(sign in str(error).lower() for sign in SIGNS)
+
+
+def free() -> None:
+    """Give back what torch holds of a GPU's memory and does not use."""
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+
+
+class Parts:
+    """Consecutive parts of at most ``size`` rows (None: whole) in which gradients are summed up.
+
+    ``halvings`` counts how often memory did not suffice.
+    """
+
+    def __init__(self, size: int | None) -> None:
+        self.size, self.halvings = size, 0
+
+    def sum(
+        self, minibatch: Batch, optimiser: torch.optim.Optimizer, meter: Any, one: Callable[[Batch], Tensor]
+    ) -> Any:
+        """The sum of ``one(part)``, which adds a part's gradient, over all parts of a minibatch.
+
+        When memory runs out the gradient and the books of the meter go back, and everything is done again in
+        parts of half the size; OutOfMemory when a part is a single row.
+        """
+        books = meter.books()
+
+        def attempt(size: int | None) -> Any:
+            meter.restore(books)
+            optimiser.zero_grad(set_to_none=True)
+            return sum(one(part) for part in minibatch.split(size))
+
+        return self.fitting(len(minibatch), attempt, optimiser)
+
+    def fitting(
+        self, rows: int, attempt: Callable[[int | None], Any], optimiser: torch.optim.Optimizer
+    ) -> Any:
+        """What ``attempt(size)`` gives, which computes a gradient over ``rows`` rows from nothing, ``size``
+        at a time; once more at half the size when memory runs out.
+        """
+        while True:
+            try:
+                return attempt(self.size)
+            except (RuntimeError, MemoryError) as error:
+                if not is_out_of_memory(error):
+                    raise
+                now = min(self.size or rows, rows)
+                if now == 1:
+                    raise OutOfMemory(_advice(error)) from error
+            # outside the except clause, which keeps the failed pass's tensors alive
+            optimiser.zero_grad(set_to_none=True)
+            self.size, self.halvings = (now + 1) // 2, self.halvings + 1
+            free()
+
+    def metrics(self) -> dict[str, float]:
+        """The size in force and how often it was halved; nothing while memory sufficed."""
+        if not self.halvings:
+            return {}
+        return {
+            "train/micro_batch_size": float(self.size or 0),
+            "train/memory_halvings": float(self.halvings),
+        }
+
+
+def _advice(error: BaseException) -> str:
+    reason = (str(error).splitlines() or [""])[0][:200]
+    return (
+        f"Memory is not enough for the gradient of a single row ({reason}). The step was not taken. Use a "
+        "smaller model or less of it (language: --tune lora, --lora-layers, --gradient-checkpointing, fewer "
+        "--max-new-tokens and --max-prompt-tokens; control: smaller --hidden), or a device with more memory."
+    )

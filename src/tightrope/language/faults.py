@@ -1,0 +1,67 @@
+"""Faults of a rollout, said before anything is learned from it: numbers that are not finite, memory."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+import torch
+
+from tightrope.algorithms.memory import OutOfMemory, free, is_out_of_memory
+from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
+from tightrope.language.roles import Roles
+
+if TYPE_CHECKING:
+    from tightrope.language.collect import Experience
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def advising_on_memory(gather: F) -> F:
+    """``gather``, which where memory runs out does without ``keep``; without it an OutOfMemory says which
+    setting to lower.
+    """
+
+    @functools.wraps(gather)
+    def advising(roles: Roles, *args: Any, **how: Any) -> Experience:
+        try:
+            return cast("Experience", gather(roles, *args, **how))
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            if not how.get("keep"):
+                raise _advice(roles, error) from error
+        # outside the except clause, which keeps the failed pass's tensors alive
+        free()
+        return advising(roles, *args, **{**how, "keep": False})
+
+    return cast(F, advising)
+
+
+def _advice(roles: Roles, error: BaseException) -> OutOfMemory:
+    reason = (str(error).splitlines() or [""])[0][:200]
+    return OutOfMemory(
+        f"Memory is not enough to sample {roles.settings.batch_size} responses at once ({reason}). Choose a "
+        "smaller --batch-size, --max-new-tokens or --max-prompt-tokens; --micro-batch-size makes the pass "
+        "over the finished responses smaller."
+    )
+
+
+def refuse_bad_numbers(experience: Experience, roles: Roles) -> None:
+    """NonFiniteError when a role gave a number that is not finite; a bad weight is named."""
+    said = (
+        ("log-probability of sampling", experience.responses.logp),
+        ("log-probability", experience.logp),
+        ("log-probability of the reference", experience.ref_logp),
+        ("value", experience.values),
+    )
+    mask = experience.responses.mask
+    found = first_bad((f"The {name} of response, token ", torch.where(mask, x, 0.0)) for name, x in said)
+    if found is None:
+        return
+    weight = first_bad((f"the weight {name}", p) for name, p in roles.named_parameters())
+    raise NonFiniteError(
+        f"{found}; expected a finite number{f', but {weight}' if weight else ': the logits overflow'}. "
+        "Nothing was learned from this batch. Look for a learning rate that is too high."
+    )

@@ -1,0 +1,399 @@
+"""A fault of an environment is named in full and bounded in time, or survived by making it anew."""
+
+import json
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+import tightrope
+from tightrope.cli import main
+from tightrope.control.collect import BadNumbers
+from tightrope.control.environments import EnvironmentFault, make_environments
+from tightrope.control.faults import FaultPolicy, pause, renewed_seed
+
+SMALL = {"num_envs": 4, "num_steps": 16, "minibatch_size": 32, "num_epochs": 1, "seed": 5}
+AT = 5
+
+
+class Frail(gym.Env):
+    """The observation tells the seed and the step; copy ``row`` (seeded with 5 + row) fails at step AT."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, how, row=3, always=False, length=40):
+        self.how, self.row, self.always, self.length, self.mine, self.t = how, row, always, length, False, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.seed, self.mine = seed, self.always or seed == SMALL["seed"] + self.row
+            if self.how == "reset" and self.mine:
+                raise OSError("no display")
+        self.t = 0
+        return np.array([seed or 0, 0, 0], np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        observation, reward = np.array([0, self.t, int(action)], np.float32), 1.0
+        if self.mine and self.t == AT:
+            if self.how == "raise":
+                raise RuntimeError("the simulator broke")
+            if self.how == "exit":
+                os._exit(7)
+            if self.how == "kill":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if self.how == "hang":
+                time.sleep(600)
+            if self.how == "shape":
+                observation = np.zeros(4, np.float32)
+            if self.how == "nan":
+                observation[1] = np.nan
+            if self.how == "reward":
+                reward = np.inf
+            if self.how == "tuple":
+                return observation, reward, False, {}
+        return observation, reward, False, self.t == self.length, {}
+
+
+@pytest.fixture
+def agent_on():
+    """Makes agents, and closes them whatever happens."""
+    made = []
+
+    def make(*arguments, **more):
+        made.append(make_agent(*arguments, **more))
+        return made[-1]
+
+    yield make
+    for agent in made:
+        agent.close()
+
+
+def make_agent(how, backend="workers", **more):
+    own = {name: more.pop(name) for name in ("row", "always", "length") if name in more}
+
+    def frail():
+        return Frail(how, **own)
+
+    workers = {"num_workers": 2} if backend == "workers" else {}
+    settings = {**SMALL, "vector_backend": backend, "engine": "torch", **workers, **more}
+    return tightrope.PPO(frail, **settings)
+
+
+def weights(agent):
+    return torch.cat([p.detach().flatten().clone() for p in agent.policy.parameters()])
+
+
+def children():
+    """Processes that this one started and that are still there, zombies included."""
+    return Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left_behind():
+    before, segments, threads = set(children()), set(os.listdir("/dev/shm")), set(threading.enumerate())
+    yield
+    multiprocessing.active_children()
+    assert set(children()) <= before
+    assert set(os.listdir("/dev/shm")) <= segments
+    left = set(threading.enumerate()) - threads
+    assert not [thread for thread in left if thread.name == "tightrope-watchdog"]
+
+
+WORDS = {
+    "raise": "RuntimeError: the simulator broke",
+    "exit": r"has died \(exit code 7\)",
+    "kill": r"has died \(exit code -9\)",
+    "hang": r"not (back after|answered for) 0.5 s \(env_timeout\)",
+    "shape": r"shape \(4,\), the space says \(3,\)",
+    "tuple": "expected 5, got 4",
+}
+
+
+@pytest.mark.parametrize(
+    ("how", "backend", "engine"),
+    [(how, "workers", "torch") for how in WORDS]
+    + [(how, "serial", "torch") for how in ("raise", "hang", "shape", "tuple")]
+    + [("raise", "serial", "fused"), ("kill", "workers", "fused")],
+)
+def test_every_fault_names_environment_worker_step_seed_and_action(how, backend, engine, agent_on):
+    agent = agent_on(how, backend, engine=engine, env_timeout=0.5)
+    before, begin = weights(agent), time.monotonic()
+    with pytest.raises(EnvironmentFault, match=WORDS[how]) as caught:
+        agent.learn(1000)
+    assert time.monotonic() - begin < 10
+    fault, text = caught.value, str(caught.value)
+    worker = 1 if backend == "workers" else 0
+    assert (fault.index, fault.step, fault.env_id, fault.worker, fault.seed) == (3, AT, "frail", worker, 8)
+    assert fault.action in ("0", "1") and f"last action {fault.action}" in text
+    assert "environment 3" in text and "step 5" in text and "seed 8" in text and "frail" in text
+    assert f"worker {worker}" in text if worker else "in this process" in text
+    if how == "raise":
+        assert "Traceback" in text and 'RuntimeError("the simulator broke")' in text
+    assert torch.equal(weights(agent), before)
+
+
+@pytest.mark.parametrize("backend", ["workers", "serial"])
+@pytest.mark.parametrize(("how", "what"), [("nan", "observation = nan"), ("reward", "reward = inf")])
+def test_numbers_that_are_not_finite_are_named_likewise(how, what, backend, agent_on):
+    agent = agent_on(how, backend)
+    worker = "worker 1" if backend == "workers" else "in this process"
+    step = AT if how == "nan" else AT - 1
+    with pytest.raises(BadNumbers, match=rf"Environment 3 of .*{what} at step {step}.*\({worker}, seed 8, "):
+        agent.learn(1000)
+
+
+def test_the_action_named_is_the_one_that_led_there(agent_on):
+    agent = agent_on("nan", "serial")
+    with pytest.raises(BadNumbers) as caught:
+        agent.learn(1000)
+    action = int(re.search(r"last action (\d)", str(caught.value))[1])
+    assert action == agent.collector._rollout.actions[3, AT - 1, 0]
+
+
+# --------------------------------------------------------------------------------------------------- restart
+
+
+@pytest.mark.parametrize("how", ["raise", "exit", "kill", "hang", "shape", "tuple", "nan", "reward", "reset"])
+def test_with_restart_a_run_goes_on_and_counts_it(how, agent_on):
+    agent = agent_on(how, on_env_fault="restart", env_timeout=0.5)
+    counts = [progress.metrics["rollout/environment_restarts"] for progress in agent.iterate(256)]
+    assert counts[0] == 1.0 and sum(counts) == 1.0
+    assert agent.environments.restarts == 1
+    assert bool(torch.isfinite(weights(agent)).all())
+
+
+@pytest.mark.parametrize("how", ["raise", "hang", "nan", "tuple"])
+def test_the_same_in_this_process_and_to_the_same_bits(how, agent_on):
+    """A fault that leaves the process alive cuts one copy, whoever steps it."""
+    results = []
+    for backend in ("serial", "workers", "serial"):
+        if how == "hang" and backend == "workers":
+            continue  # there the whole process is replaced, and its other copy with it
+        agent = agent_on(how, backend, on_env_fault="restart", env_timeout=0.5)
+        agent.learn(256)
+        results.append(weights(agent))
+        agent.close()
+    assert all(torch.equal(results[0], other) for other in results[1:])
+
+
+def test_death_is_survived_to_the_same_bits_each_time(agent_on):
+    results = []
+    for _ in range(2):
+        agent = agent_on("exit", on_env_fault="restart")
+        agent.learn(256)
+        results.append(weights(agent))
+        agent.close()
+    assert torch.equal(*results)
+
+
+@pytest.mark.parametrize(("how", "rows"), [("raise", [3]), ("exit", [2, 3])])
+def test_the_failed_step_does_not_count_and_the_one_before_is_bootstrapped(how, rows, agent_on):
+    from tightrope.control.collect import to_batch
+
+    plain = {"normalise_observations": False, "normalise_rewards": False}
+    agent = agent_on(how, on_env_fault="restart", length=12, **plain)
+    agent.collector.reset(SMALL["seed"], 0)
+    rollout = agent.collector.collect(agent.engine, 16)
+    others = [row for row in range(4) if row not in rows]
+    column = AT - 1  # the fifth step
+    assert not rollout.mask[rows, column].any() and rollout.ended[rows, column].all()
+    assert rollout.mask.sum() == 64 - len(rows) == rollout.steps
+    assert rollout.mask[others].all() and not rollout.terminated.any()
+    # the episode that was cut is none; the next ones begin anew behind it, with a seed of their own
+    assert rollout.episodes == [(12.0, 12, False)] * len(others)
+    seeds = [renewed_seed(SMALL["seed"], 1, row) for row in rows]
+    np.testing.assert_array_equal(rollout.inputs["flat"][rows, column + 1, 0], np.float32(seeds))
+    assert (agent.collector._lengths[rows] == 16 - AT).all()
+    batch = to_batch(rollout, agent.engine, agent.normalisers, agent.settings.update)
+    values, rewards = batch.old_values, torch.from_numpy(rollout.rewards).float()
+    delta = rewards + agent.settings.update.gamma * values.roll(-1, 1) - values
+    torch.testing.assert_close(batch.advantages[rows, column - 1], delta[rows, column - 1])
+    assert (batch.advantages[rows, column] == 0).all()
+
+
+def test_an_environment_that_fails_only_in_the_reset_after_an_episode_loses_no_step():
+    class FailsToReset(Frail):
+        def reset(self, *, seed=None, options=None):
+            if seed is None and self.seed == 5:
+                raise OSError("no display")
+            return super().reset(seed=seed)
+
+    policy = FaultPolicy(restart=True, max_restarts=3)
+    with make_environments(lambda: FailsToReset("no", length=2), 2, policy=policy) as environments:
+        environments.reset(5)
+        first, second, third = (environments.step(np.zeros((2, 1), np.float32)) for _ in range(3))
+        assert first.cut is None and second.cut is None and third.cut is None
+        assert second.truncated.all() and second.rewards.tolist() == [1.0, 1.0]
+        assert second.final_inputs["flat"][:, 1].tolist() == [2.0, 2.0]
+        assert second.inputs["flat"][:, 0].tolist() == [np.float32(renewed_seed(5, 1, 0)), 0.0]
+        assert environments.restarts == 1
+
+
+@pytest.mark.parametrize(("how", "backend"), [("raise", "serial"), ("raise", "workers"), ("exit", "workers")])
+def test_an_environment_that_always_fails_ends_the_run_after_so_many_restarts(how, backend, agent_on):
+    agent = agent_on(how, backend, always=True, on_env_fault="restart", max_env_restarts=3, num_envs=2)
+    begin = time.monotonic()
+    with pytest.raises(EnvironmentFault, match="max_env_restarts allows no more") as caught:
+        agent.learn(1000)
+    assert time.monotonic() - begin < 20
+    assert re.search(r"made anew [34] times", str(caught.value))
+
+
+def test_pauses_grow_and_stay_bounded():
+    assert [pause(n, None) for n in (1, 2, 3, 9, 10_000)] == [0.05, 0.1, 0.2, 2.0, 2.0]
+    assert pause(9, 0.4) == 0.1  # well below the time limit
+
+
+@pytest.mark.parametrize(("policy", "code"), [("raise", 2), ("restart", 2)])
+def test_the_command_ends_with_2_and_says_why(policy, code, capsys, tmp_path):
+    gym.register("tightrope_tests/Frail-v0", entry_point=lambda: Frail("raise", always=True))
+    words = ["--total-steps", "500", "--run-dir", str(tmp_path / "r"), "--max-env-restarts", "2"]
+    try:
+        assert main(["train", "tightrope_tests/Frail-v0", "--on-env-fault", policy, *words]) == code
+    finally:
+        del gym.registry["tightrope_tests/Frail-v0"]
+    error = capsys.readouterr().err
+    assert "RuntimeError: the simulator broke" in error and "tightrope_tests/Frail-v0" in error
+    assert ("max_env_restarts" in error) == (policy == "restart")
+
+
+def test_restarts_are_in_the_metrics_of_a_run_and_episodes_are_none_of_them(tmp_path):
+    gym.register("tightrope_tests/Frail-v0", entry_point=lambda: Frail("raise", row=0))
+    words = ["--total-steps", "400", "--num-steps", "16", "--num-envs", "2", "--seed", "5", "--quiet"]
+    words += ["--minibatch-size", "32", "--num-epochs", "1", "--engine", "torch", "--evaluate-every", "none"]
+    words += ["--checkpoint-every", "none"]
+    try:
+        assert main(
+            ["train", "tightrope_tests/Frail-v0", *words, "--on-env-fault", "restart", "--run-dir",
+             str(tmp_path / "r")]
+        ) == 0  # fmt: skip
+    finally:
+        del gym.registry["tightrope_tests/Frail-v0"]
+    rows = [json.loads(line) for line in (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()]
+    assert [row["rollout/environment_restarts"] for row in rows][:3] == [1.0, 0.0, 0.0]
+    episodes = (tmp_path / "r" / "episodes.jsonl").read_text().splitlines()
+    assert {json.loads(line)["length"] for line in episodes} == {40}
+
+
+# ------------------------------------------------------------------------------- states that come and go
+
+
+class Keeper(Frail):
+    """Copy 3 fails when it gives (``how`` "kill get") or takes its state."""
+
+    def _keep(self, when):
+        how, _, at = self.how.partition(" ")
+        if self.mine and at == when:
+            os.kill(os.getpid(), signal.SIGKILL) if how == "kill" else time.sleep(600)
+
+    def get_state(self):
+        self._keep("get")
+        return self.t
+
+    def set_state(self, state):
+        self._keep("set")
+        self.t = state
+
+
+@pytest.mark.parametrize(
+    ("how", "backend", "words"),
+    [
+        (
+            "kill get",
+            "workers",
+            r"worker 1 .* died \(exit code -9\).* state of environment 3: step 1, .*seed 8",
+        ),
+        (
+            "kill set",
+            "workers",
+            r"worker 1 .* died \(exit code -9\).* state of environment 3: the reset, seed 8",
+        ),
+        ("hang get", "workers", r"worker 1 .* not answered for 0.5 s .* state of environment 3: step 1, "),
+        (
+            "hang get",
+            "serial",
+            r"the state of environment 3 .* cannot be kept: Overdue: not back after 0.5 s",
+        ),
+    ],
+)
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_fault_while_a_state_is_kept_is_named_and_ends_the_run(how, backend, words, restart):
+    policy = FaultPolicy(restart, 3, 0.5)
+    number = {"num_workers": 2} if backend == "workers" else {}
+    with make_environments(lambda: Keeper(how), 4, backend=backend, policy=policy, **number) as environments:
+        environments.reset(SMALL["seed"])
+        environments.step(np.zeros((4, 1), np.float32))
+        with pytest.raises(EnvironmentFault, match=words.replace("worker 1", "worker [12]")):
+            environments.set_state(environments.get_state())
+
+
+# --------------------------------------------------------------------------------- vector environments
+
+
+class FrailVector(gym.vector.SyncVectorEnv):
+    """Two Frails in one; only the first one ever made fails."""
+
+    made = 0
+
+    def __init__(self, num_envs=2, how="raise", **_):
+        type(self).made += 1
+        how = how if type(self).made == 1 else "no"
+        super().__init__([lambda: Frail(how, row=1)] * num_envs, autoreset_mode="SameStep")
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [("raise", "raised RuntimeError: the simulator broke"), ("hang", "not back after 0.5 s")],
+)
+def test_a_vector_environment_of_the_users_own_is_named_and_cannot_be_made_anew(how, words):
+    FrailVector.made = 0
+    vector = FrailVector(how=how)
+    agent = tightrope.PPO(vector, **{**SMALL, "num_envs": 2}, on_env_fault="restart", env_timeout=0.5)
+    with pytest.raises(EnvironmentFault, match=words) as caught:
+        agent.learn(1000)
+    text = str(caught.value)
+    assert "at step 5" in text and "seed 5" in text and "last action [[" in text
+    assert "cannot be made anew" in text and "Traceback" in text
+    agent.close()
+    vector.close()
+
+
+def test_a_vector_version_of_an_id_is_made_anew_with_all_its_copies():
+    FrailVector.made = 0
+    kinds = {"entry_point": lambda: Frail("no"), "vector_entry_point": FrailVector}
+    gym.register("tightrope_tests/FrailVector-v0", **kinds)
+    settings = {**SMALL, "num_envs": 2, "vector_backend": "vector", "on_env_fault": "restart"}
+    try:
+        agent = tightrope.PPO("tightrope_tests/FrailVector-v0", **settings, engine="torch")
+        FrailVector.made = 1
+        first = next(agent.iterate(256))
+        assert first.metrics["rollout/environment_restarts"] == 1.0
+        rollout = agent.collector._rollout
+        assert not rollout.mask[:, AT - 1].any() and rollout.mask.sum() == 30
+        agent.close()
+    finally:
+        del gym.registry["tightrope_tests/FrailVector-v0"]
+
+
+def test_evaluation_leaves_out_what_a_fault_cut(agent_on):
+    from tightrope.control.evaluate import evaluate_agent
+
+    agent = agent_on("no", "serial")
+    policy = FaultPolicy(restart=True, max_restarts=5)
+    with make_environments(lambda: Frail("raise", row=1, length=7), 2, policy=policy) as environments:
+        found = evaluate_agent(agent, environments, 6, seed=5)
+        assert environments.restarts == 1
+    assert found["returns"] == [7.0] * 6
+    agent.close()
