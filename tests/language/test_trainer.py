@@ -194,8 +194,8 @@ def test_held_out_prompts_are_answered_as_many_at_a_time_as_a_batch_has(folder, 
     """The memory ledger counts on it."""
     from tightrope.language import trainer as module
 
-    sizes, real = [], module.gather
-    monkeypatch.setattr(module, "gather", lambda roles, prompts, *more: (
+    sizes, real = [], module.respond
+    monkeypatch.setattr(module, "respond", lambda roles, prompts, *more: (
         sizes.append(len(prompts)), real(roles, prompts, *more))[1])  # fmt: skip
     settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, held_out_prompts=10)
     made = Trainer(settings, [chr(97 + k % 26) * (1 + k // 26) for k in range(44)], letters, letters, silent)

@@ -27,37 +27,46 @@ from tightrope.maths.statistics import masked_mean, masked_sum, masked_variance
 
 
 @dataclass
-class Experience:
-    """Responses and what the roles say of them. ``tokens``, ``real``: prompt and response, [B, P + R].
+class Answers:
+    """Responses to prompts. ``tokens``, ``real``: prompt and response, [B, P + R]; ``seconds``: to sample.
+
+    ``lower``: what enters the trunk's upper part, [B, P + R, d], where that was computed.
+    """
+
+    tokens: Tensor
+    real: Tensor
+    responses: Responses
+    seconds: float
+    lower: Tensor | None
+
+    def ids(self) -> list[list[int]]:
+        """The token ids of each response, padding left out."""
+        pairs = zip(self.responses.tokens, self.responses.mask, strict=True)
+        return [tokens[mask].tolist() for tokens, mask in pairs]
+
+
+@dataclass
+class Experience(Answers):
+    """Responses and what the roles say of them.
 
     ``logp``, ``ref_logp``, ``entropy``, ``exact`` (KL of the state), ``values``: [B, R]. ``final_values``
     [B]: V of the state after the last token. ``lower`` and ``ref_hidden`` are kept for the epochs that
     follow, ``said`` for the first one: the same numbers with their gradients.
     """
 
-    tokens: Tensor
-    real: Tensor
-    responses: Responses
     logp: Tensor
     ref_logp: Tensor
     entropy: Tensor
     exact: Tensor
     values: Tensor
     final_values: Tensor
-    lower: Tensor | None
     ref_hidden: Tensor | None
     said: Said | None
-    seconds: float
 
     @property
     def last(self) -> Tensor:
         """[B]: the column of each response's last real token."""
         return self.responses.mask.sum(1) - 1
-
-    def ids(self) -> list[list[int]]:
-        """The token ids of each response, padding left out."""
-        pairs = zip(self.responses.tokens, self.responses.mask, strict=True)
-        return [tokens[mask].tolist() for tokens, mask in pairs]
 
 
 class PromptOrder:
@@ -77,6 +86,23 @@ class PromptOrder:
 
 
 @advising_on_memory
+def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Answers:
+    """``samples`` responses of the policy to each prompt; rows of one prompt are neighbours."""
+    settings, begin = roles.settings, time.perf_counter()
+    device = next(roles.model.parameters()).device
+    tokens, real = (x.to(device) for x in pad_left([prompt.tokens for prompt in prompts]))
+    shape = len(prompts) * samples, settings.max_new_tokens
+    uniforms = torch.from_numpy(np.random.default_rng([seed, 8, iteration]).random(shape)).to(device)
+    with roles.frozen_policy():
+        responses = sample(
+            roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples
+        )
+    tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
+    real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
+    return Answers(tokens, real, responses, time.perf_counter() - begin, lower=None)
+
+
+@advising_on_memory
 def gather(
     roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int, *, keep: bool = False
 ) -> Experience:
@@ -86,20 +112,9 @@ def gather(
     its own for an update whose first pass is over all rows: that would say the same again. OutOfMemory, with
     advice, when memory runs out without ``keep`` as well.
     """
-    settings = roles.settings
-    begin = time.perf_counter()
-    device = next(roles.model.parameters()).device
-    tokens, real = (x.to(device) for x in pad_left([prompt.tokens for prompt in prompts]))
-    rows = len(prompts) * samples
-    numbers = np.random.default_rng([seed, 8, iteration]).random((rows, settings.max_new_tokens))
-    with roles.frozen_policy():
-        uniforms = torch.from_numpy(numbers).to(device)
-        responses = sample(
-            roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples
-        )
-    seconds = time.perf_counter() - begin
-    tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
-    real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
+    settings, answers = roles.settings, respond(roles, prompts, seed, iteration, samples)
+    tokens, real, responses = answers.tokens, answers.real, answers.responses
+    rows = len(tokens)
     keep = keep and len(length_groups(real, responses.mask)) == 1
     size = rows if keep else settings.update.micro_batch_size or rows
     # a folded weight rounds otherwise than weight and adapter apart, which is what trains: in float32 within
@@ -110,7 +125,7 @@ def gather(
     said = tuple(pieces[0][name] for name in ("logp", "entropy", "exact", "values")) if keep else None
     pieces = [{name: None if x is None else x.detach() for name, x in piece.items()} for piece in pieces]
     joined = {name: _joined([piece[name] for piece in pieces]) for name in pieces[0]}
-    return Experience(tokens=tokens, real=real, responses=responses, said=said, seconds=seconds, **joined)
+    return Experience(tokens, real, responses, answers.seconds, said=said, **joined)
 
 
 def _joined(parts: list[Any]) -> Any:

@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def advising_on_memory(gather: F) -> F:
-    """``gather``, which where memory runs out does without ``keep``; without it an OutOfMemory says which
-    setting to lower.
+def advising_on_memory(function: F) -> F:
+    """``function(roles, ...)``, which where memory runs out does without ``keep``; without it an OutOfMemory
+    says which setting to lower.
     """
 
-    @functools.wraps(gather)
-    def advising(roles: Roles, *args: Any, **how: Any) -> Experience:
+    @functools.wraps(function)
+    def advising(roles: Roles, *args: Any, **how: Any) -> Any:
         try:
-            return cast("Experience", gather(roles, *args, **how))
+            return function(roles, *args, **how)
         except (RuntimeError, MemoryError) as error:
-            if not is_out_of_memory(error):
+            if isinstance(error, OutOfMemory) or not is_out_of_memory(error):
                 raise
             if not how.get("keep"):
                 raise _advice(roles, error) from error

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tightrope.language import lora
 from tightrope.language.answers import Fault, RewardError
-from tightrope.language.collect import Experience
+from tightrope.language.collect import Answers
 from tightrope.language.data import Prompt
 from tightrope.language.models import fingerprint
 from tightrope.language.reward_model import RewardModel, last_real, load_reward
@@ -40,21 +40,19 @@ class Judge:
         self.roles, self.functions, self.model, self.adapter = roles, functions, model, adapter
         self.weight = weight
 
-    def __call__(
-        self, prompts: Sequence[Prompt], experience: Experience, trainer_state: Any = None
-    ) -> Scores:
+    def __call__(self, prompts: Sequence[Prompt], answers: Answers, trainer_state: Any = None) -> Scores:
         """Scores of the responses to ``prompts``, one prompt a response."""
-        found = self._of_functions(prompts, experience, trainer_state)
-        learnt = self._of_model(experience)
+        found = self._of_functions(prompts, answers, trainer_state)
+        learnt = self._of_model(answers)
         if learnt is not None:
             return with_model(found, learnt, self.weight)
         assert found is not None
         return found
 
-    def _of_functions(self, prompts: Sequence[Prompt], experience: Experience, state: Any) -> Scores | None:
+    def _of_functions(self, prompts: Sequence[Prompt], answers: Answers, state: Any) -> Scores | None:
         if self.functions is None:
             return None
-        ids = experience.ids()
+        ids = answers.ids()
         texts = [self.roles.tokenizer.decode(row, skip_special_tokens=True) for row in ids]
         completions = [
             text if isinstance(prompt.shown, str) else [{"role": "assistant", "content": text}]
@@ -65,20 +63,20 @@ class Judge:
         return self.functions.score([p.shown for p in prompts], completions, ids, columns, state)
 
     @torch.no_grad()
-    def _of_model(self, experience: Experience) -> np.ndarray | None:
+    def _of_model(self, answers: Answers) -> np.ndarray | None:
         if self.model is None and self.adapter is None:
             return None
-        size = self.roles.settings.update.micro_batch_size or len(experience.tokens)
+        size = self.roles.settings.update.micro_batch_size or len(answers.tokens)
         scores = []
-        for start in range(0, len(experience.tokens), size):
+        for start in range(0, len(answers.tokens), size):
             rows = slice(start, start + size)
-            tokens, real = experience.tokens[rows], experience.real[rows]
+            tokens, real = answers.tokens[rows], answers.real[rows]
             if self.model is not None:
                 scores.append(self.model.score(tokens, real).float())
                 continue
             assert self.adapter is not None
             head, shift = self.adapter
-            lower = None if experience.lower is None else experience.lower[rows]
+            lower = None if answers.lower is None else answers.lower[rows]
             hidden = self.roles.adapter_hidden("reward", tokens, real, lower)
             scores.append((last_real(hidden, real).float() @ head.float().T)[:, 0] - shift)
         return torch.cat(scores).double().cpu().numpy()

@@ -25,6 +25,7 @@ from tightrope.language.collect import (
     describe,
     gather,
     kl_share,
+    respond,
     rewards_of,
     to_batch,
 )
@@ -331,7 +332,8 @@ class Trainer:
         size, seed, found = self.settings.batch_size, self.settings.seed + 1_000_003, list[np.ndarray]()
         for number, start in enumerate(range(0, len(self.held_out), size)):
             prompts = self.held_out[start : start + size]
-            scores = self.gold(prompts, gather(self.roles, prompts, seed, number, 1), self._trainer_state())
+            answers = respond(self.roles, prompts, seed, number, 1)
+            scores = self.gold(prompts, answers, self._trainer_state())
             found.append(scores.total[scores.valid])
         judged = np.concatenate(found)
         return float(judged.mean()) if len(judged) else float("nan")
