@@ -30,12 +30,18 @@ def train(job: dict[str, Any]) -> dict[str, Any]:
 
     torch.set_num_threads(job["threads"])
     folder = job["folder"]
-    tokenizer = AutoTokenizer.from_pretrained(folder, padding_side="left")
+    tokenizer = AutoTokenizer.from_pretrained(folder, padding_side="left", trust_remote_code=False)
     if tokenizer.pad_token is None:
         tokenizer.pad_token = tokenizer.eos_token
-    policy, reference = (AutoModelForCausalLM.from_pretrained(folder, dtype=torch.float32) for _ in range(2))
+    policy, reference = (
+        AutoModelForCausalLM.from_pretrained(folder, dtype=torch.float32, trust_remote_code=False)
+        for _ in range(2)
+    )
     kind = AutoModelForSequenceClassification
-    reward, critic = (kind.from_pretrained(folder, num_labels=1, dtype=torch.float32) for _ in range(2))
+    reward, critic = (
+        kind.from_pretrained(folder, num_labels=1, dtype=torch.float32, trust_remote_code=False)
+        for _ in range(2)
+    )
     for model in (policy, reference, reward, critic):
         model.config.pad_token_id = tokenizer.pad_token_id
     rows = [{"input_ids": tokenizer(text)["input_ids"]} for text in OPENINGS * 256]

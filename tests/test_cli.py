@@ -191,21 +191,24 @@ def test_the_settings_of_another_command_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("values", "flag", "again"),
+    ("values", "typed", "again"),
     [
-        ({"data": "<list>"}, "--data", "rows.jsonl"),
-        ({"reward": "score"}, "--reward", "length"),
-        ({"reward": "mine.py:score"}, "--reward", "mine.py:score"),
-        ({"gold": "mine.py:score"}, "--gold", "none"),
+        ({"data": "<list>"}, "--data FILE", "rows.jsonl"),
+        ({"reward": "score"}, "--reward FILE.py:function", "length"),
+        ({"reward": "mine.py:score"}, "--reward mine.py:score", "mine.py:score"),
+        ({"reward": "x.py:f; rm -r ~"}, "--reward FILE.py:function", "length"),  # no file writes commands
+        ({"gold": "mine.py:score"}, "--gold mine.py:score", "none"),
     ],
 )
 def test_what_was_an_object_or_code_is_named_again(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, values: dict[str, str], flag: str, again: str
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, values: dict[str, str], typed: str, again: str
 ) -> None:
     settings = {**shown(capsys, "align", "--reward", "length"), **values}
     (tmp_path / "settings.json").write_text(json.dumps(settings))
     code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
-    assert code == 2 and f"Give it again: {flag}" in err and str(*values.values()) in err
+    assert code == 2 and err.endswith(f"tightrope align --settings {tmp_path} {typed}\n"), err
+    assert str(*values.values()) in err
+    flag = typed.partition(" ")[0]
     found = shown(capsys, "align", "--settings", str(tmp_path), flag, again)
     assert found[flag[2:]] == (None if again == "none" else again)
 

@@ -23,6 +23,7 @@ from tightrope.options import (
     resume_parser,
     train_options,
 )
+from tightrope.runs.records import printable
 
 # ---------------------------------------------------------------------------- commands
 
@@ -309,7 +310,7 @@ def main(words: list[str] | None = None) -> int:
             return 1
         if not isinstance(error, OSError) and not _is_ours(error):
             raise
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        print(f"{PROGRAM}: {printable(str(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

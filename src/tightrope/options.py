@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from tightrope.flags import (
     whole,
     with_dashes,
 )
+from tightrope.runs.records import retyped
 
 PROGRAM = "tightrope"
 
@@ -276,8 +278,8 @@ def overrides(given: Options, file_values: Options) -> tuple[str, Options]:
         raise UsageError("Which task? Give a Gymnasium id: tightrope train CartPole-v1")
     if "env" not in given and ":" in env:
         raise UsageError(
-            f"The settings file names the task {env}, whose module would be imported. Code is named by you "
-            f"and never by a file: tightrope train {env} --settings ..."
+            f"The settings file names the task {env!r}, whose module would be imported. Code is named by you "
+            f"and never by a file: {PROGRAM} train {retyped(env, 'ID')} --settings FILE"
         )
     return env, values
 
@@ -310,9 +312,11 @@ def file_values(name: str, path: str | None, flags: Options) -> Options:
     values = {key: x for key, x in values.items() if key not in flags}
     for key, value in values.items():
         if _must_be_named(key, value):
+            word = "FILE.py:function" if key in ("reward", "gold") else "FILE"
             raise UsageError(
                 f"--settings {path}: {key} was {value!r}, which no file may name: an object, code, or a "
-                f"folder that is gone. Give it again: --{key.replace('_', '-')} ..."
+                f"folder that is gone. Give it again: {PROGRAM} {name} --settings {shlex.quote(path)} "
+                f"--{key.replace('_', '-')} {retyped(value, word)}"
             )
     return values
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 
 import pytest
-from source_tree import SRC, imports, module_of, name_of, sources
+from source_tree import ROOT, SRC, files, imports, module_of, name_of, sources
 
 UNPICKLERS = {
     "pickle",
@@ -22,13 +22,25 @@ RUNNERS = {"eval", "exec", "compile", "__import__"}
 LOADERS = {
     ("torch", "load"),
     ("hub", "load"),
+    ("jit", "load"),
+    ("os", "system"),
+    ("os", "popen"),
     ("yaml", "load"),
     ("yaml", "unsafe_load"),
     ("yaml", "full_load"),
     ("runpy", "run_path"),
     ("runpy", "run_module"),
 }
-KEYWORDS = {"allow_pickle", "trust_remote_code"}
+KEYWORDS = {"allow_pickle", "trust_remote_code", "shell"}
+NAMED_ALONE = {
+    "read_pickle",
+    "Unpickler",
+    "load_module",
+    "import_module",
+    "exec_module",
+    "spec_from_file_location",
+}
+DISTRUSTED = {"from_pretrained", "from_config"}  # of transformers: they run code unless told not to
 
 # Where something of the kind is allowed, and why. Nothing else is, and an entry that is not needed fails.
 TRANSPORT = "multiprocessing hands the user's own live factory to a worker when it starts"
@@ -52,6 +64,9 @@ EXCEPTIONS = {
 }
 
 
+SHOWN = {("benchmarks/speed_peers.py", "import_module"): "the peers that the benchmark itself names"}
+
+
 def findings(module: ast.Module, name: str = "tightrope.x") -> set[tuple[int, str]]:
     """Line and word of every place where data could become code."""
     found = set()
@@ -64,9 +79,14 @@ def findings(module: ast.Module, name: str = "tightrope.x") -> set[tuple[int, st
             found.add((line, ".".join(parts[-2:])))
         if parts[0] == "importlib" and parts[-1] in ("import_module", "spec_from_file_location"):
             found.add((line, parts[-1]))
+    called = {id(node.func) for node in ast.walk(module) if isinstance(node, ast.Call)}
     for node in ast.walk(module):
         if isinstance(node, ast.Call):
             found |= {(node.lineno, word) for word in _called(node)}
+        elif isinstance(node, ast.Attribute) and node.attr in DISTRUSTED and id(node) not in called:
+            found.add((node.lineno, node.attr))  # handed on: who calls it may say anything
+        elif isinstance(node, ast.Name) and node.id in RUNNERS - {"compile"}:
+            found.add((node.lineno, node.id))  # also handed on: map(eval, texts)
     return found
 
 
@@ -78,8 +98,8 @@ def _called(call: ast.Call) -> list[str]:
         last = ast.unparse(function.value).rpartition(".")[2]
         if (last, function.attr) in LOADERS or (last == "builtins" and function.attr in RUNNERS):
             words.append(f"{last}.{function.attr}")
-        if function.attr in ("import_module", "exec_module", "spec_from_file_location"):
-            words.append(function.attr)
+        words += [function.attr] if function.attr in NAMED_ALONE else []
+        words += [function.attr] if function.attr in DISTRUSTED and not _distrusts(call) else []
     for keyword in call.keywords:
         constant = keyword.value.value if isinstance(keyword.value, ast.Constant) else "something"
         if keyword.arg in KEYWORDS and constant is not False:
@@ -89,6 +109,27 @@ def _called(call: ast.Call) -> list[str]:
         if keyword.arg == "cache" and constant is not False:
             words.append("cache=")
     return words
+
+
+def _distrusts(call: ast.Call) -> bool:
+    return any(
+        keyword.arg == "trust_remote_code"
+        and isinstance(keyword.value, ast.Constant)
+        and keyword.value.value is False
+        for keyword in call.keywords
+    )
+
+
+def test_what_is_shown_is_as_careful():
+    """Examples, demos and benchmarks too; a command is started there, but never by a shell."""
+    found = [
+        f"{name_of(path)}:{line} {word}"
+        for folder in ("examples", "demos", "benchmarks")
+        for path in files(".py", under=ROOT / folder)
+        for line, word in findings(ast.parse(path.read_text()))
+        if (name_of(path), word) not in SHOWN
+    ]
+    assert not found, "\n".join(found)
 
 
 def test_data_never_becomes_code():
@@ -115,6 +156,25 @@ def test_data_never_becomes_code():
         "torch.load(path, weights_only=True)",
         "torch.hub.load(path)",
         "eval(text)",
+        "list(map(eval, texts))",
+        "run = exec",
+        "compile(text, '', 'exec')",
+        "builtins.eval(text)",
+        "import dill",
+        "import shelve",
+        "import marshal",
+        "from _pickle import loads",
+        "yaml.unsafe_load(file)",
+        "numpy.lib.format.read_array(file, allow_pickle=True)",
+        "pandas.read_pickle(path)",
+        "torch.jit.load(path)",
+        "os.system(text)",
+        "subprocess.run(text, shell=True)",
+        "AutoModel.from_pretrained(path)",
+        "AutoModel.from_config(config)",
+        "AutoModel.from_pretrained(path, trust_remote_code=flag)",
+        "make(AutoModel.from_pretrained, path)",
+        "datasets.load_dataset(name, trust_remote_code=True)",
         "exec(text)",
         "builtins.exec(text)",
         "__import__(name)",
@@ -139,6 +199,8 @@ def test_the_lint_sees_it(code: str):
         "numpy.load(path, allow_pickle=False)",
         "re.compile(text)",
         "from safetensors.torch import load",
+        "AutoModel.from_pretrained(path, trust_remote_code=False)",
+        "subprocess.run(words, shell=False)",
     ],
 )
 def test_the_lint_lets_pass(code: str):

@@ -304,6 +304,31 @@ def test_a_state_that_cannot_be_kept_names_the_environment():
             environments.get_state()
 
 
+def test_a_state_of_other_shapes_is_refused(tmp_path):
+    """The compiled engine would read beyond it."""
+    run = tmp_path / "run"
+    train.train(settings_for(walk, engine="torch", total_steps=200), run_dir=run, env=walk)
+    folder, tensors, state = Run.open(run).newest()
+    short, ints = np.zeros(1), np.zeros(4, np.float32)
+    for name, wrong in {"_returns": short, "_lengths": ints, "_inputs": {"flat": ints[:, None]}}.items():
+        episodes = {**state["episodes"], name: states.pack(wrong)}
+        checkpoint.save(folder, tensors, {**state, "episodes": episodes})
+        with pytest.raises(
+            checkpoint.CheckpointError, match=f"{name[1:]} of the episodes have another shape"
+        ):
+            train.resume(run, env=walk)
+    for seed in ("1", 2**70, -1):
+        environments = {**state["episodes"]["environments"], "seed": seed}
+        episodes = {**state["episodes"], "environments": environments}
+        checkpoint.save(folder, tensors, {**state, "episodes": episodes})
+        with pytest.raises(checkpoint.CheckpointError, match=f"the seed of the episodes is {seed}"):
+            train.resume(run, env=walk)
+    checkpoint.save(folder, tensors, state)
+    Run.open(run).update_settings({**Run.open(run).settings, "total_steps": "many"})
+    with pytest.raises(checkpoint.CheckpointError, match="run does not hold what belongs there"):
+        train.resume(run, env=walk)
+
+
 def test_resume_says_what_it_cannot_promise(tmp_path, monkeypatch):
     settings = settings_for("CartPole-v1", engine="torch")
     killed(settings, tmp_path / "run", monkeypatch, Agent, "_one_update", 4)

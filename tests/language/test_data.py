@@ -109,9 +109,16 @@ def test_a_dataset_is_read_by_its_id(monkeypatch):
         asked.append((name, split))
         return [{"text": "a"}]
 
-    monkeypatch.setitem(sys.modules, "datasets", SimpleNamespace(load_dataset=load_dataset))
+    monkeypatch.setitem(
+        sys.modules, "datasets", SimpleNamespace(__version__="4.0.0", load_dataset=load_dataset)
+    )
     assert read_rows("owner/name") == read_rows("owner/name:test") == [{"text": "a"}]
     assert asked == [("owner/name", "train"), ("owner/name", "test")]
+    old = SimpleNamespace(__version__="3.6.0", load_dataset=load_dataset)  # it may run a dataset's script
+    monkeypatch.setitem(sys.modules, "datasets", old)
+    with pytest.raises(ValueError, match=r"is 3\.6\.0, which may run a script.*pip install 'datasets>=4'"):
+        read_rows("owner/name")
+    assert len(asked) == 2
     monkeypatch.setitem(sys.modules, "datasets", None)
     with pytest.raises(ValueError, match=r"no file 'owner/name'.*pip install datasets"):
         read_rows("owner/name")

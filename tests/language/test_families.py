@@ -1,5 +1,7 @@
 """Models that are not quite a Llama: scaled or capped logits, windows of attention, layers further down."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from language.tiny import VOCABULARY, padded, saved
@@ -7,7 +9,7 @@ from language.tiny import VOCABULARY, padded, saved
 from tightrope.algorithms.optimise import SamplingMismatch
 from tightrope.language import AlignSettings, heads, selfcheck
 from tightrope.language.data import Example
-from tightrope.language.ledger import Job, ledger
+from tightrope.language.ledger import Job, ledger, reward_model_bytes
 from tightrope.language.models import attention_window, load_causal, parts
 from tightrope.language.packing import collate, row_of
 from tightrope.language.reward_model import load_reward
@@ -178,6 +180,7 @@ def test_a_reward_model_without_fused_attention_loads(tmp_path):
     folder, tokens = saved(tmp_path, model), torch.randint(4, 60, (2, 5))
     got = load_reward(folder).score(tokens, torch.ones(2, 5, dtype=torch.bool))
     assert got.shape == (2,) and got.isfinite().all()
+    assert reward_model_bytes(Path(folder)) == 4 * sum(p.numel() for p in model.parameters())
 
 
 @pytest.mark.parametrize(("dtype", "limit"), [("float32", LOG_RATIO_LIMIT), ("bfloat16", LOWERED_LIMIT)])

@@ -14,6 +14,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
+from tightrope.control.faults import EnvironmentFault
 from tightrope.runs import checkpoint, history, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY, CannotWrite, remove_leftovers, writing
@@ -372,3 +373,20 @@ def test_leftovers_of_a_crash_go_and_nothing_else(tmp_path: Path) -> None:
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"nowhere.*no such folder"):
         checkpoint.load(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("error", [KeyError("steps"), ValueError("shape"), RuntimeError("size mismatch")])
+def test_a_state_that_is_not_understood_is_the_checkpoint_s_fault(tmp_path: Path, error: Exception) -> None:
+    with (
+        pytest.raises(CheckpointError, match="does not hold what belongs there"),
+        checkpoint.understood(tmp_path),
+    ):
+        raise error
+
+
+@pytest.mark.parametrize(
+    "error", [EnvironmentFault("env 3 raised"), torch.OutOfMemoryError(), OSError("disk")]
+)
+def test_what_else_goes_wrong_is_not(tmp_path: Path, error: Exception) -> None:
+    with pytest.raises(type(error)), checkpoint.understood(tmp_path):
+        raise error

@@ -134,9 +134,12 @@ def test_a_run_that_is_let_go_is_free_again(path: Path) -> None:
 def test_the_lock_is_no_link(path: Path, tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("mine")
     (path / NAME).unlink()
+    run = Run.open(path)
     (path / NAME).symlink_to(tmp_path / "precious")
     with pytest.raises(OSError, match=NAME):
-        Run.open(path).lock()
+        run.lock()
+    with pytest.raises(ValueError, match=f"{NAME} is a link"):
+        Run.open(path)
     assert (tmp_path / "precious").read_text() == "mine"
 
 

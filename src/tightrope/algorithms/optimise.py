@@ -68,15 +68,20 @@ def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Adam's moments, copied in place where they exist: the compiled engine may hold views of them."""
+    """Adam's moments, copied in place where they exist: the compiled engine may hold views of them. Raises
+    ValueError for those of other parameters.
+    """
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     for name, saved in tensors.items():
         index, kind = name.split(".", 1)
-        entry = optimiser.state[parameters[int(index)]]
+        parameter = parameters[int(index)]
+        if saved.shape != (() if kind == "step" else parameter.shape):
+            raise ValueError(f"{name} of the optimiser has shape {tuple(saved.shape)}")
+        entry = optimiser.state[parameter]
         if kind in entry:
             entry[kind].copy_(saved)
         else:
-            entry[kind] = saved.to(parameters[int(index)].device).clone()
+            entry[kind] = saved.to(parameter.device).clone()
 
 
 class Meter:

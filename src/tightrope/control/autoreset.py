@@ -312,7 +312,8 @@ class VectorCopies:
     def set_state(self, found: list[Any]) -> None:
         """Go on from what `get_state` gave, after a reset."""
         states.put_back(self._env, found[0])
-        self._ended, self._any_ended = np.array(found[1], bool), any(found[1])
+        self._ended = np.array(found[1], bool).reshape(self._ended.shape)
+        self._any_ended = _any(self._ended)
 
     def close(self) -> None:
         """Close the environment unless it is the caller's own; closing twice is fine."""

@@ -111,10 +111,15 @@ class Collector:
         return {**own, "environments": self.environments.get_state()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on with the episodes of a `state`."""
-        self.environments.set_state(state["environments"])
-        for name in ("_inputs", "_action_mask", "_returns", "_lengths"):
-            setattr(self, name, states.unpack(state[name]))
+        """Go on with the episodes of a `state`. ValueError for one of other environments."""
+        inputs, action_mask = self.environments.set_state(state["environments"])
+        zeros = np.zeros(self.environments.num_envs)
+        like = {"_inputs": inputs, "_action_mask": action_mask, "_returns": zeros}
+        for name, fresh in {**like, "_lengths": zeros.astype(np.int64)}.items():
+            found = states.unpack(state[name])
+            if not states.alike(found, fresh):  # the compiled engine would read beyond it
+                raise ValueError(f"{name.strip('_')} of the episodes have another shape than here")
+            setattr(self, name, found)
 
     def count_from(self, restarts: int) -> None:
         """So many environments were made anew before; the rows so far have told of them."""

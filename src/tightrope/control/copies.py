@@ -148,12 +148,13 @@ class EnvCopies:
         found = self._keeping(lambda: states.of_copies(self._own, self._workers))
         return {"seed": self._seed, "renewals": self._slots.renewals.tolist(), "states": found}
 
-    def set_state(self, found: dict[str, Any]) -> None:
-        """Reset, and go on from what `get_state` gave."""
-        self.reset(found["seed"])
+    def set_state(self, found: dict[str, Any]) -> tuple[Inputs, np.ndarray | None]:
+        """Reset, and go on from what `get_state` gave; returns what the reset did."""
+        fresh = self.reset(found["seed"])
         self._slots.renewals[:] = found["renewals"]
         self._renewals = sum(found["renewals"])
         self._keeping(lambda: states.into_copies(found["states"], self._own, self._workers))
+        return fresh
 
     def _keeping(self, states_go: Callable[[], Any]) -> Any:
         """A fault while states come or go ends the run: a copy made anew would be in another one."""

@@ -108,9 +108,14 @@ class Environments:
         """What the copies are in the middle of, as JSON can hold it; EnvironmentFault when it cannot."""
         return self._copies.get_state()
 
-    def set_state(self, found: dict[str, Any]) -> None:
-        """Reset every copy, and go on from what `get_state` gave."""
-        self._copies.set_state(found)
+    def set_state(self, found: dict[str, Any]) -> tuple[Inputs, np.ndarray | None]:
+        """Reset every copy, and go on from what `get_state` gave; returns what the reset did. ValueError for
+        a seed that no run has.
+        """
+        seed = found["seed"]
+        if not isinstance(seed, int) or not 0 <= seed < 2**63:
+            raise ValueError(f"the seed of the episodes is {str(seed)[:80]}")
+        return self._copies.set_state(found)
 
     def step(self, actions: np.ndarray) -> Step:
         """Act in every copy; ``actions`` [B, A] float32 as sampled, bounds are taken care of here."""

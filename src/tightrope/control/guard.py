@@ -87,11 +87,12 @@ class GuardedVector:
         """The state of the environment, and what its seed is made of."""
         return {"seed": self._seed, "renewals": self._renewals, "states": self._copies.get_state()}
 
-    def set_state(self, found: dict[str, Any]) -> None:
-        """Reset, and go on from what `get_state` gave."""
-        self.reset(found["seed"])
-        self._renewals = found["renewals"]
+    def set_state(self, found: dict[str, Any]) -> tuple[Inputs, np.ndarray | None]:
+        """Reset, and go on from what `get_state` gave; returns what the reset did."""
+        fresh = self.reset(found["seed"])
+        self._renewals = int(found["renewals"])
         self._copies.set_state(found["states"])
+        return fresh
 
     def count_from(self, restarts: int) -> None:
         """So many restarts are behind the run already."""

@@ -128,8 +128,14 @@ class Normalisers:
         }
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
-        """Take over what ``state`` gave."""
+        """Take over what ``state`` gave. ValueError for statistics of other observations: the compiled engine
+        would read beyond them.
+        """
         for kind, part in {"observations": self.observations, "rewards": self.rewards}.items():
             if part is not None:
                 prefix = f"{kind}."
-                part.load({k.removeprefix(prefix): x for k, x in state.items() if k.startswith(prefix)})
+                found = {k.removeprefix(prefix): x for k, x in state.items() if k.startswith(prefix)}
+                for name, own in part.state().items():
+                    if found[name].shape != own.shape or found[name].dtype != own.dtype:
+                        raise ValueError(f"{prefix}{name} is {found[name].dtype} {tuple(found[name].shape)}")
+                part.load(found)

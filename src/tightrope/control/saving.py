@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from tightrope.control.settings import TrainSettings, settings_from_json, settin
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
 from tightrope.runs.history import Checkpoint
+from tightrope.runs.records import retyped
 
 
 def save_agent(agent: Agent, folder: Path) -> Path:
@@ -59,21 +61,21 @@ def load(
     needed when the saved policy was a module of your own.  ``engine``: who computes further updates (auto,
     fused, torch); with another ``device`` it is chosen anew.
     """
-    tensors, state = read(Path(path), best=best)
-    settings = settings_from_json(state["settings"])
+    folder, tensors, state = read(Path(path), best=best)
+    with checkpoint.understood(folder):
+        settings, own_policy = settings_from_json(state["settings"]), bool(state["own_policy"])
+        own_environment = bool(state["own_environment"]) or ":" in settings.env
     if device is not None and device != settings.device:
         settings = settings.with_values(device=device, engine="auto")
     if engine is not None:
         settings = settings.with_values(engine=engine)
-    if state["own_policy"] and policy is None:
+    if own_policy and policy is None:
         raise ValueError(
             f"{path} holds a policy module of your own. Pass it again: load({str(path)!r}, policy=module)."
         )
-    if env is None and (state["own_environment"] or ":" in settings.env):
-        raise ValueError(
-            f"{path} was trained on {settings.env!r}, which no file may import. Pass it again: "
-            f"load({str(path)!r}, env=...), or on the command line --env-module FILE.py."
-        )
+    if env is None and own_environment:
+        again = name_again(path, settings.env, "evaluate")
+        raise ValueError(f"{again} In Python: load({str(path)!r}, env=...).")
     if env is not None:
         name, rows = (
             env if isinstance(env, str) else settings.env,
@@ -81,38 +83,50 @@ def load(
         )
         settings = dataclasses.replace(anywhere(settings), env=name, num_envs=rows)
     agent = rebuild(settings.env if env is None else env, path, policy=policy, settings=settings)
-    restore(agent, tensors, state)
+    with checkpoint.understood(folder):
+        restore(agent, tensors, state)
     return agent
 
 
-def rebuild(env: Any, path: str | Path, *, settings: TrainSettings, **more: Any) -> Agent:
-    """An agent for saved settings; a task that is not registered (any more) is answered with what to name."""
+def name_again(path: str | Path, env: str, command: str) -> str:
+    """What to type about a run whose task is the user's own code: no file may say what is imported."""
+    registered = "" if ":" in env else " --env-module FILE.py"
+    words = f"tightrope {command} {shlex.quote(str(path))} --env {retyped(env, 'ID')}{registered}"
+    return (
+        f"{path} was trained on {env!r}, a task of somebody's own code, which no file may import. If it is "
+        f"yours, or you have read it, name it again: {words}."
+    )
+
+
+def rebuild(
+    env: Any, path: str | Path, *, settings: TrainSettings, command: str = "evaluate", **more: Any
+) -> Agent:
+    """An agent for saved settings; a task that is not registered (any more) is answered with what to type."""
     try:
         return AGENTS[settings.algorithm](env, settings=settings, **more)
     except ValueError as error:
         if not str(error).startswith("unknown environment id"):
             raise
         raise ValueError(
-            f"{error} {path} was trained on it: where your own code registers it, name that code again, "
-            "with --env-module FILE.py on the command line or an import in Python."
+            f"{error} {path} was trained on it: where your own code registers it, name that code again: "
+            f"tightrope {command} {shlex.quote(str(path))} --env-module FILE.py, or import it in Python."
         ) from error
 
 
-def read(path: Path, *, best: bool = False) -> tuple[dict[str, dict[str, torch.Tensor]], dict[str, Any]]:
-    """Tensors and state of a run, also while it is written, or of a folder that ``save`` wrote. Raises
-    ValueError when there are none.
+def read(path: Path, *, best: bool = False) -> Checkpoint:
+    """The checkpoint of a run, also while it is written, or of a folder that ``save`` wrote. ValueError where
+    there is none.
     """
     if (present(path) / "manifest.json").is_file():
-        return checkpoint.load(path)
+        return Checkpoint(path, *checkpoint.load(path))
     from tightrope.runs.run import Run
 
     run = Run.open(path)
     if not best:
-        point = run.newest()
-        return point.tensors, point.state
+        return run.newest()
     if not present(run.best).is_dir():
         raise ValueError(f"{path} has no best policy: no evaluation took place. Leave --best out.")
-    return checkpoint.load(run.best)
+    return Checkpoint(run.best, *checkpoint.load(run.best))
 
 
 def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: dict[str, Any]) -> None:
@@ -124,7 +138,8 @@ def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: di
     if running is not None and len(running) != agent.environments.num_envs:
         normalisers["rewards.running"] = torch.zeros(agent.environments.num_envs, dtype=torch.float64)
     agent.normalisers.load(normalisers)
-    agent.steps, agent.kl_beta = int(state["steps"]), state["kl_beta"]
+    beta = state["kl_beta"]
+    agent.steps, agent.kl_beta = int(state["steps"]), None if beta is None else float(beta)
     agent.rollbacks = int(state.get("rollbacks", 0))  # none in a run begun before they were
     agent.collector.count_from(int(state.get("environment_restarts", 0)))
     agent.sampling_rng.bit_generator.state = state["rng"]["sampling"]

@@ -73,6 +73,15 @@ def unpack(value: Any) -> Any:
     raise ValueError(f"a saved state holds {str(value)[:80]}, which this version does not read.")
 
 
+def alike(found: Any, like: Any) -> bool:
+    """Whether two arrays, or dicts of them, agree in names, dtypes and shapes; None agrees with None."""
+    if isinstance(found, dict) and isinstance(like, dict):
+        return found.keys() == like.keys() and all(alike(found[name], like[name]) for name in like)
+    if isinstance(found, np.ndarray) and isinstance(like, np.ndarray):
+        return found.shape == like.shape and found.dtype == like.dtype
+    return found is None and like is None
+
+
 def _layers(env: gym.Env) -> tuple[list[TimeLimit], Any] | None:
     """The time limits around the layer that gives a state, and that layer; None where there is none, or where
     a wrapper outside it has a state that nobody knows.

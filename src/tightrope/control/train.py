@@ -11,9 +11,18 @@ from typing import Any
 from tightrope.control.agent import AGENTS, Agent, Progress
 from tightrope.control.evaluate import EVALUATION_SEED, evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
-from tightrope.control.saving import rebuild, restore, resume_episodes, roll_back, save_agent, snapshot
+from tightrope.control.saving import (
+    name_again,
+    rebuild,
+    restore,
+    resume_episodes,
+    roll_back,
+    save_agent,
+    snapshot,
+)
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import signals
+from tightrope.runs.checkpoint import understood
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.grid import crosses
 from tightrope.runs.history import steps_in
@@ -76,21 +85,32 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
     run_dir = run.path
     point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
     state: dict[str, Any] = {} if point is None else point.state
-    settings = settings_from_json(state.get("settings", run.settings))
-    if env is None and (state.get("own_environment") or ":" in settings.env):
+    with understood(run_dir if point is None else point.folder):
+        settings = settings_from_json(run.settings if point is None else state["settings"])
+        own_environment = bool(state.get("own_environment")) or ":" in settings.env
+        own_policy = bool(state.get("own_policy"))
+        best = float("-inf") if state.get("best") is None else float(state["best"])
+        wall = float(state.get("wall_seconds", 0.0))
+    if env is None and own_environment:
+        raise ValueError(name_again(run_dir, settings.env, "resume"))
+    if own_policy and policy is None:
         raise ValueError(
-            f"{run_dir} was trained on {settings.env!r}, which no file may import. Name your code again: "
-            f"tightrope resume {run_dir} --env {settings.env}, with --env-module FILE.py where it is "
-            "registered there."
+            f"{run_dir} holds a policy module of somebody's own, which no file may import. Go on in Python: "
+            f"tightrope.control.train.resume({str(run_dir)!r}, policy=module)."
         )
     # of a run that was extended and stopped before its next checkpoint, settings.json alone knows the budget
-    total_steps = int(run.settings["total_steps"]) if total_steps is None else total_steps
+    if total_steps is None:
+        with understood(run_dir):
+            total_steps = int(run.settings["total_steps"])
     settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
-    agent = rebuild(source, run_dir, policy=policy, settings=settings, notify=_notice(report))
+    more = {"policy": policy, "settings": settings, "notify": _notice(report)}
+    agent = rebuild(source, run_dir, command="resume", **more)
     if point is not None:
-        restore(agent, point.tensors, state)
-        for line in resume_episodes(agent, state):
+        with understood(point.folder):
+            restore(agent, point.tensors, state)
+            lines = resume_episodes(agent, state)
+        for line in lines:
             report("line", {"text": line})
     run.rewind(point)
     run.update_settings(settings_to_json(agent.settings))
@@ -99,8 +119,7 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
             "line",
             {"text": f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there."},
         )
-    best = float("-inf") if state.get("best") is None else state["best"]
-    return _continue(agent, run, settings.total_steps, report, best=best, wall=state.get("wall_seconds", 0.0))
+    return _continue(agent, run, settings.total_steps, report, best=best, wall=wall)
 
 
 def _continue(

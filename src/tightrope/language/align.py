@@ -7,6 +7,7 @@ run = align(model="path/to/model", prompts=prompts, reward=reward, total_episode
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tightrope.language.saving import restore_state
 from tightrope.language.settings import NOT_HERE, AlignSettings
 from tightrope.language.trainer import Aligned, Trainer
 from tightrope.runs.history import steps_in
+from tightrope.runs.records import retyped
 from tightrope.runs.run import Run, teller
 
 __all__ = ["Aligned", "align", "resume_align"]
@@ -100,12 +102,13 @@ def resume_align(
         if value is None and known not in (None, "length") and not Path(known).is_dir():
             raise ValueError(
                 f"The {name} of {run_dir} was {known!r}: code, which no file may import, or a folder that is "
-                f"not there any more. Name it again: tightrope resume {run_dir} --{name} FILE.py:function"
+                "not there any more. If it is yours, or you have read it, name it again: tightrope resume "
+                f"{shlex.quote(str(run_dir))} --{name} {retyped(known, 'FILE.py:function')}"
             )
     if prompts is None and not Path(settings.data).is_file():
         raise ValueError(
             f"The prompts of {run_dir} were {settings.data!r}, which is no file. Give them again: "
-            f"tightrope resume {run_dir} --data PROMPTS.jsonl"
+            f"tightrope resume {shlex.quote(str(run_dir))} --data PROMPTS.jsonl"
         )
     if settings.threads:
         torch.set_num_threads(settings.threads)
@@ -137,8 +140,11 @@ def settings_from_json(data: dict[str, Any]) -> AlignSettings:
     """The settings of an alignment run's settings.json. ValueError for another command's, or unknown
     names.
     """
-    if "update" not in data or "max_new_tokens" not in data:
+    inner = data.get("update")
+    if not isinstance(inner, dict) or "max_new_tokens" not in data:
         raise ValueError("These are not the settings of an alignment run.")
-    return AlignSettings().with_values(**{k: v for k, v in data.items() if k != "update"}, **{
-        name: value for name, value in data["update"].items() if name not in NOT_HERE
-    })  # fmt: skip
+    outer = {name: value for name, value in data.items() if name != "update"}
+    own = {name: value for name, value in inner.items() if name not in NOT_HERE}
+    if twice := sorted(set(outer) & set(own)):
+        raise ValueError(f"The settings name {', '.join(twice)} twice, outside and inside update.")
+    return AlignSettings().with_values(**outer, **own)

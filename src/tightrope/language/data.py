@@ -106,6 +106,8 @@ def _read_file(path: Path) -> list[Any]:
         raise ValueError(f"{path} is not UTF-8 text ({error}). Convert it.") from error
     except (json.JSONDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not readable as {kind[1:]} ({error}).") from error
+    except RecursionError as error:
+        raise ValueError(f"{path} is not readable as {kind[1:]}: it is nested too deeply.") from error
     filled = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
     if kind == ".txt":
         return [line for _, line in filled]
@@ -153,6 +155,7 @@ def _table(file: Iterable[str], path: Path) -> list[Any]:
 
 def _read_hub(name: str) -> Any:
     """A dataset by its id, its split ``train`` unless another is named behind a colon."""
+    name, _, split = name.partition(":")
     if Path(name).suffix.lower() in FILES or Path(name).exists() or not name:
         raise ValueError(f"There is no file {name!r}. Give one ending with {', '.join(FILES)}.")
     try:
@@ -162,7 +165,11 @@ def _read_hub(name: str) -> Any:
             f"There is no file {name!r}, and reading a dataset by its id needs another package. Install it "
             f"with: pip install datasets. Or give a file: {', '.join(FILES)}."
         ) from error
-    name, _, split = name.partition(":")
+    if int(datasets.__version__.partition(".")[0]) < 4:
+        raise ValueError(
+            f"The package datasets is {datasets.__version__}, which may run a script that lies beside the "
+            "data; expected 4 or newer, which runs none. Update it: pip install 'datasets>=4'."
+        )
     return datasets.load_dataset(name, split=split or "train")
 
 

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from tightrope.language.align import settings_from_json
 from tightrope.language.data import Prompt, pad_left, read_prompts
 from tightrope.language.models import eos_ids, find_model, load_causal, load_tokenizer
 from tightrope.language.samples import read_samples
 from tightrope.language.sampling import sample
+from tightrope.language.settings import AlignSettings
 from tightrope.language.token_stats import Sampling
 from tightrope.runs.run import Run
 
@@ -28,7 +30,7 @@ def sample_run(
     ``seed`` of sampling: by default the run's + 1. Raises ValueError where there is no finished run.
     """
     path = Path(path)
-    settings = Run.open(path).settings
+    settings = settings_from_json(Run.open(path).settings)
     if seed is not None and seed < 0:
         raise ValueError(f"seed is {seed}, expected 0 or more.")
     if not (path / "model" / "config.json").is_file():
@@ -37,11 +39,11 @@ def sample_run(
         )
     rows = list(prompt) if prompt else _prompts_of(path, count)
     tokenizer = load_tokenizer(str(path / "model"))
-    longest, number = int(settings["max_prompt_tokens"]), int(settings["seed"]) + 1 if seed is None else seed
+    longest, number = settings.max_prompt_tokens, settings.seed + 1 if seed is None else seed
     prompts = read_prompts([{"prompt": row} for row in rows], tokenizer, max_tokens=longest)
     texts = {
         name: respond(folder, prompts, settings, number)
-        for name, folder in (("before", find_model(settings["model"])), ("after", str(path / "model")))
+        for name, folder in (("before", find_model(settings.model)), ("after", str(path / "model")))
     }
     return [
         {"prompt": one.shown, "before": before, "after": after}
@@ -59,13 +61,13 @@ def _prompts_of(path: Path, count: int) -> list[Any]:
     return list(found.values())
 
 
-def respond(folder: str, prompts: Sequence[Prompt], settings: dict[str, Any], seed: int) -> list[str]:
+def respond(folder: str, prompts: Sequence[Prompt], settings: AlignSettings, seed: int) -> list[str]:
     """One response to every prompt, sampled as in training."""
     model, tokenizer = load_causal(folder), load_tokenizer(folder)
     tokens, real = pad_left([prompt.tokens for prompt in prompts])
     stops = eos_ids(model, tokenizer)
-    sampling = Sampling(settings["temperature"], settings["top_k"], stops if settings["ignore_eos"] else ())
-    numbers = np.random.default_rng([seed, 8]).random((len(prompts), settings["max_new_tokens"]))
+    sampling = Sampling(settings.temperature, settings.top_k, stops if settings.ignore_eos else ())
+    numbers = np.random.default_rng([seed, 8]).random((len(prompts), settings.max_new_tokens))
     found = sample(model, tokens, real, sampling, torch.from_numpy(numbers), stops)
     rows = zip(found.tokens, found.mask, strict=True)
     return [tokenizer.decode(ids[mask].tolist(), skip_special_tokens=True) for ids, mask in rows]

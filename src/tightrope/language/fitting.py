@@ -36,9 +36,11 @@ from tightrope.language.models import (
     require_device,
     without_dropout,
 )
+from tightrope.language.reading import pretrained
 from tightrope.language.saving import Progress, load_progress, put_back, save_progress, tensors_of
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs import signals
+from tightrope.runs.checkpoint import understood
 from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run, teller
 
@@ -91,7 +93,7 @@ def present_memory(settings: SupervisedSettings, given: tuple[Any, Any] | None, 
 
     place = torch.device(settings.device)
     weights = [] if given is None else [p for p in given[0].parameters() if p.device.type == place.type]
-    config = AutoConfig.from_pretrained(find_model(settings.model)) if given is None else given[0].config
+    config = pretrained(AutoConfig, find_model(settings.model)) if given is None else given[0].config
     found, available = ledger(config, job_of(settings)), available_memory(place)
     report("line", {"text": found.text()})
     check(found, None if available is None else available + sum(p.nbytes for p in weights))
@@ -228,7 +230,8 @@ def fit(
     fresh = Progress(objective.name, len(items), micro_batch_size=settings.micro_batch_size)
     now, saved = load_progress(run, fresh, teller(report))
     if saved is not None:
-        put_back(saved.tensors, parameters, optimiser)
+        with understood(saved.folder):
+            put_back(saved.tensors, parameters, optimiser)
     run.rewind(saved)  # without a checkpoint what stands at step 0 is recorded again
     run.update_settings(dataclasses.asdict(settings))
     facts = {"run_dir": str(run.path), "step": now.step, "total_steps": total}

@@ -18,6 +18,8 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 
+from tightrope.language.models import fused
+from tightrope.language.reading import pretrained, without_weights
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SupervisedSettings
 from tightrope.language.shapes import Shapes, shapes_of
 from tightrope.language.token_stats import CHUNK
@@ -201,9 +203,9 @@ def reward_model_bytes(folder: Path) -> int:
     path = folder / "model" if (folder / "model" / "config.json").is_file() else folder
     if not (path / "config.json").is_file():
         return 0
-    config = AutoConfig.from_pretrained(path)
+    config = pretrained(AutoConfig, path)
     with torch.device("meta"):
-        base = AutoModel.from_config(config)
+        base = fused(without_weights, AutoModel, config)
     return FLOAT * (sum(p.numel() for p in base.parameters()) + config.get_text_config().hidden_size)
 
 

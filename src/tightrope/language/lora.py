@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.models import parts
+from tightrope.language.reading import read_object, read_tensors
 from tightrope.runs.durable import writing
 
 
@@ -268,9 +269,17 @@ def save_adapter(
 
 def load_adapter(model: Any, name: str, folder: Path) -> None:
     """Add an adapter that `save_adapter` (or PEFT) wrote. ValueError when it does not fit the model."""
-    from safetensors.torch import load_file
-
-    config = json.loads((folder / "adapter_config.json").read_text(encoding="utf-8"))
-    layers = config.get("layers_to_transform")
-    add_adapter(model, name, int(config["r"]), float(config["lora_alpha"]), tuple(layers) if layers else None)
-    load_adapter_state(model, name, load_file(folder / "adapter_model.safetensors"))
+    config = read_object(folder / "adapter_config.json")
+    rank, alpha, chosen = config.get("r"), config.get("lora_alpha"), config.get("layers_to_transform")
+    state = read_tensors(folder / "adapter_model.safetensors")
+    ranks, count = {len(x) for key, x in state.items() if ".lora_A." in key}, len(parts(model).layers)
+    layers = chosen if isinstance(chosen, list) and chosen else list(range(count))
+    inside = all(isinstance(layer, int) and 0 <= layer < count for layer in layers)
+    if not (isinstance(rank, int) and {rank} == ranks and isinstance(alpha, int | float) and inside):
+        raise ValueError(
+            f"{folder / 'adapter_config.json'} has r {rank!r}, lora_alpha {alpha!r}, layers_to_transform "
+            f"{chosen!r}; expected the rank {sorted(ranks)} of its weights, a number, and some of the "
+            f"model's {count} layers. Was it made for another model?"
+        )
+    add_adapter(model, name, rank, float(alpha), tuple(layers))
+    load_adapter_state(model, name, state)

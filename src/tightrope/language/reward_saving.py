@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from tightrope.language import lora
 from tightrope.language.fitting import Loaded
 from tightrope.language.models import fingerprint
+from tightrope.language.reading import without_weights
 from tightrope.runs.durable import whole
 
 SHIFT = "tightrope_reward_shift"  # in config.json: score = what the head says - shift
@@ -29,7 +30,7 @@ def reward_skeleton(loaded: Loaded) -> Any:
         # another token than the last one, silently. Without a padding id it refuses batches instead.
         config.pad_token_id = None
     with torch.device("meta"):
-        skeleton = AutoModelForSequenceClassification.from_config(config)
+        skeleton = without_weights(AutoModelForSequenceClassification, config)
     if not isinstance(getattr(skeleton, "score", None), nn.Linear) or skeleton.score.bias is not None:
         raise ValueError(
             f"{type(skeleton).__name__} has no bias-free head called score, so that a reward model of it "

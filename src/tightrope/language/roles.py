@@ -28,6 +28,7 @@ from tightrope.language.models import (
     parts,
     require_device,
 )
+from tightrope.language.reading import pretrained
 from tightrope.language.settings import AlignSettings
 from tightrope.language.token_stats import Sampling
 from tightrope.language.trunk import Trunk
@@ -199,7 +200,7 @@ def present_memory(
     extra = texts * (settings.max_prompt_tokens + settings.max_new_tokens)
     sizes = tuple((judge.resolve().name, reward_model_bytes(judge)) for judge in judges)
     job = job_of(settings, reward=reward, extra_tokens=extra, judges=sizes)
-    found = ledger(AutoConfig.from_pretrained(folder), job)
+    found = ledger(pretrained(AutoConfig, folder), job)
     notify(found.text())
     check(found, available_memory(settings.device))
 

@@ -74,7 +74,25 @@ def read_samples(path: str | Path) -> list[dict[str, Any]]:
     file = path / "samples.jsonl" if path.is_dir() else path
     if not file.is_file():
         raise ValueError(f"{file} is not there: {path} is no run of tightrope align, or has not begun.")
-    return read_lines(file)
+    rows = read_lines(file)
+    for number, row in enumerate(rows):
+        if not _is_sample(row):
+            raise ValueError(f"{file}, row {number}, is no response as tightrope align records them.")
+    return rows
+
+
+def _is_sample(row: dict[str, Any]) -> bool:
+    """Whether a row has what tables show of it, whoever wrote the file."""
+    scores = row.get("scores")
+    texts = (row.get("prompt"), row.get("response"))
+    numbers = [row.get(name) for name in ("score", "kl", "advantage")]
+    numbers += scores.values() if isinstance(scores, dict) else [""]
+    return (
+        all(isinstance(text, str | list) and all(isinstance(m, str | dict) for m in text) for text in texts)
+        and all(number is None or isinstance(number, int | float) for number in numbers)
+        and isinstance(row.get("step"), int)
+        and isinstance(row.get("counts"), bool)
+    )
 
 
 def spread(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
@@ -167,9 +185,9 @@ def _print_table(
 
     table = Table(title=title or None, title_justify="left", show_lines=True, highlight=False)
     for name in texts:
-        table.add_column(Text(name), ratio=1, overflow="fold")
+        table.add_column(Text(shown(name)), ratio=1, overflow="fold")
     for name in figures:
-        table.add_column(Text(name), justify="right", no_wrap=True)
+        table.add_column(Text(shown(name)), justify="right", no_wrap=True)
     for line in lines:
         table.add_row(*[Text(cell) for cell in line])  # Text: brackets in a response are not markup
     console = console or Console(file=stream, width=width, markup=False, highlight=False)

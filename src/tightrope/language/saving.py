@@ -23,6 +23,7 @@ from tightrope.language.data import Prompt
 from tightrope.language.models import find_model
 from tightrope.language.roles import Roles
 from tightrope.language.settings import AlignSettings
+from tightrope.runs.checkpoint import understood
 from tightrope.runs.durable import whole
 from tightrope.runs.history import Checkpoint, steps_in
 from tightrope.runs.rollback import rolling_back
@@ -107,12 +108,17 @@ def restore_state(trainer: Trainer, point: Checkpoint) -> None:
     folder, tensors, state = point
     if state.get("story") != "align":
         raise ValueError(f"{folder} is no checkpoint of an alignment run.")
-    if state["prompts_sha256"] != _hash_of([*trainer.prompts, *trainer.held_out]):
+    if state.get("prompts_sha256") != _hash_of([*trainer.prompts, *trainer.held_out]):
         raise ValueError(
             f"{folder} is of a run with other prompts than these {len(trainer.prompts):,}. Give those that "
             "the run began with, or begin a new run."
         )
-    put_back(tensors, trainer.roles.parameters(), trainer.optimiser)
+    with understood(folder):
+        put_back(tensors, trainer.roles.parameters(), trainer.optimiser)
+        _put_state(trainer, state)
+
+
+def _put_state(trainer: Trainer, state: dict[str, Any]) -> None:
     trainer.episodes, trainer.iteration = int(state["episodes"]), int(state["iteration"])
     trainer.kl_beta, trainer.rollbacks = float(state["kl_beta"]), int(state.get("rollbacks", 0))
     trainer.micro_batch_size = state.get("micro_batch_size", trainer.micro_batch_size)
@@ -120,7 +126,7 @@ def restore_state(trainer: Trainer, point: Checkpoint) -> None:
     trainer.update_rng.bit_generator.state = state["rng"]["update"]
     trainer.monitor.restore(state["monitor"])
     trainer.stopped, trainer.seconds = bool(state["stopped"]), float(state["seconds"])
-    trainer.newest = {name: math.nan if x is None else x for name, x in state["newest"].items()}
+    trainer.newest = {name: math.nan if x is None else float(x) for name, x in state["newest"].items()}
     if trainer.pretraining is not None:
         trainer.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 
@@ -182,11 +188,13 @@ def load_progress(
     folder, _, state = point
     if state.get("story") != fresh.story:
         raise ValueError(f"{folder} is a checkpoint of {state.get('story')!r}, expected {fresh.story!r}.")
-    found = Progress(**{field.name: state[field.name] for field in dataclasses.fields(Progress)})
+    with understood(folder):
+        found = Progress(**{field.name: state[field.name] for field in dataclasses.fields(Progress)})
+        found.newest = {name: math.nan if x is None else float(x) for name, x in found.newest.items()}
+        found.step, found.seen, found.seconds = int(found.step), int(found.seen), float(found.seconds)
     if found.items != fresh.items:
         raise ValueError(
             f"{run.path} was learning from {found.items} examples, the data now have {fresh.items}. Give the "
             "data that the run began with, or begin a new run."
         )
-    found.newest = {name: math.nan if x is None else x for name, x in found.newest.items()}
     return found, point

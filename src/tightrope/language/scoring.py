@@ -17,6 +17,7 @@ from tightrope.language.answers import Fault, RewardError
 from tightrope.language.collect import Answers
 from tightrope.language.data import Prompt
 from tightrope.language.models import fingerprint
+from tightrope.language.reading import read_metadata, read_tensors
 from tightrope.language.reward_model import RewardModel, last_real, load_reward
 from tightrope.language.rewards import Rewards, Scores, checked_weight, load_reward_function, unlike
 from tightrope.language.roles import Roles
@@ -132,10 +133,7 @@ def reward_adapter(words: Any) -> Path | None:
 
 def shares_trunk(adapter: Path, model: str) -> bool:
     """Whether a reward adapter was trained on the very weights that are aligned, wherever they lie."""
-    from safetensors import safe_open
-
-    with safe_open(adapter / "head.safetensors", "pt") as file:
-        trained = (file.metadata() or {}).get("trunk")
+    trained = read_metadata(adapter / "head.safetensors").get("trunk")
     return bool(trained) and trained == fingerprint(model)
 
 
@@ -179,9 +177,14 @@ def _weighted(entry: Any) -> tuple[Any, float]:
 
 def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:
     """The score head [1, d] and the shift that lie beside a reward adapter."""
-    from safetensors.torch import load_file
-
-    tensors = load_file(adapter / "head.safetensors")
+    tensors = read_tensors(adapter / "head.safetensors")
+    width = roles.model.config.hidden_size
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    if shapes != {"score.weight": (1, width), "shift": ()}:
+        raise ValueError(
+            f"{adapter / 'head.safetensors'} holds {shapes}, expected score.weight (1, {width}) and a shift. "
+            "Train the reward model again: tightrope reward."
+        )
     head = tensors["score.weight"].to(next(roles.model.parameters()).device)
     return head, float(tensors["shift"])
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.models import Parts, fused, parts
+from tightrope.language.reading import without_weights
 
 LENGTHS = (16, 32, 48)  # tokens at which a forward pass is measured, evenly spaced
 
@@ -51,7 +52,7 @@ def shapes_of(config: Any, dtype: str) -> Shapes:
     kind = getattr(torch, dtype)
     with torch.device("meta"):
         config = copy.deepcopy(config)  # transformers writes into it
-        model = fused(AutoModelForCausalLM.from_config, config, dtype=kind).eval()
+        model = fused(without_weights, AutoModelForCausalLM, config, dtype=kind).eval()
     found = parts(model)
     linears = [_linears(layer) for layer in found.layers]
     inner = config.get_text_config()

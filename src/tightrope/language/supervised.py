@@ -6,6 +6,7 @@ What a file holds is read again when a run goes on; an object in Python must be 
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -44,7 +45,8 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
         raise ValueError(f"{run_dir} has settings that {kind.__name__} has not: {', '.join(unknown)}.")
     for name, value in given.items():
         if value is None and str(run.settings.get(name)).startswith("<"):
-            command = f", or tightrope resume {run_dir} --data FILE" if name == "data" else ""
+            word = shlex.quote(str(run_dir))
+            command = f", or tightrope resume {word} --data FILE" if name == "data" else ""
             raise ValueError(
                 f"The {name} of {run_dir} was {run.settings[name]}, an object that no file holds. Give it "
                 f"again: {name}=... in Python{command}."

@@ -14,7 +14,7 @@ import hashlib
 import io
 import re
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -168,6 +168,25 @@ def verify(folder: Path) -> None:
             _verified(folder / name, entry, read=False)
 
     _steadily(Path(folder), check)
+
+
+@contextlib.contextmanager
+def understood(folder: Path) -> Iterator[None]:
+    """Inside, a state or tensors that are not what this library writes are a CheckpointError: a manifest
+    guards against damage, not against whoever writes one.
+    """
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError) as error:
+        kind = type(error)
+        if kind.__module__.startswith("tightrope.") or kind.__name__ == "OutOfMemoryError":
+            raise  # an environment's fault, or too little memory: not the checkpoint's
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise CheckpointError(
+            f"{folder} does not hold what belongs there ({kind.__name__}: {reason}). {_ADVICE}"
+        ) from error
 
 
 def _steadily(folder: Path, read: Callable[[Path], Any]) -> Any:

@@ -75,11 +75,14 @@ def _warn(text: str) -> None:
 def marks_of(point: Checkpoint) -> dict[str, dict[str, Any]]:
     """What a checkpoint counts on in the record files, by name. CheckpointError where it does not say."""
     marks = point.state.get("records")
-    if not isinstance(marks, dict) or not all(
-        isinstance(mark, dict) and isinstance(mark.get("bytes"), int) for mark in marks.values()
-    ):
+    if not isinstance(marks, dict) or not all(map(_is_mark, marks.values())):
         raise CheckpointError(f"{point.folder / 'state.json'} does not say what had been recorded.")
     return {name: marks[name] for name in RECORDS if name in marks}
+
+
+def _is_mark(mark: Any) -> bool:
+    size = mark.get("bytes") if isinstance(mark, dict) else None
+    return isinstance(size, int) and size >= 0 and "sha256" in mark
 
 
 def prune(checkpoints: Path, keep: int | None) -> list[Path]:

@@ -119,7 +119,7 @@ def _note(path: Path) -> dict[str, Any]:
     """What the lock file says; empty where it says nothing that can be read."""
     try:
         note = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return note if isinstance(note, dict) else {}
 

@@ -9,6 +9,9 @@ import hashlib
 import json
 import math
 import os
+import re
+import stat
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,16 +65,57 @@ def write_json(path: Path, value: Any) -> None:
 
 def read_json(path: Path) -> Any:
     """The content of a JSON file. Raises ValueError naming the file where it is not JSON (NaN literals are
-    not).
+    not), and for a key that stands twice.
     """
 
     def refuse(literal: str) -> None:
         raise ValueError(f"{literal} is not JSON")
 
     try:
-        return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+        return json.loads(
+            path.read_text(encoding="utf-8"), parse_constant=refuse, object_pairs_hook=each_key_once
+        )
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not readable as JSON ({error}).") from error
+
+
+def each_key_once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of its pairs, for the json module. ValueError for a key that stands twice: one reader takes
+    the first, another the last, so that what was checked need not be what is used.
+    """
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} stands twice")
+    return found
+
+
+def retyped(name: Any, placeholder: str) -> str:
+    """A name out of a file as a word of a command to type: itself where it is a plain id, path or
+    FILE.py:function, else the placeholder, so that no file writes commands for a user to copy.
+    """
+    plain = isinstance(name, str) and re.fullmatch(r"[\w.~/][\w.~/:-]*", name)
+    return name if plain and (":" in name or ":" not in placeholder) else placeholder
+
+
+def printable(text: str) -> str:
+    """A text that may hold what a file says, without characters by which it could rule a terminal."""
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+
+
+def refuse_links(folder: Path) -> None:
+    """ValueError for a link, a pipe or a device anywhere in a folder: who reads or writes there would be led
+    to any place of the machine.
+    """
+    for parent, folders, names in os.walk(folder):
+        for path in (Path(parent, name) for name in (*folders, *names)):
+            with contextlib.suppress(FileNotFoundError):  # the writer of the run may be at work
+                mode = path.lstat().st_mode
+                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                    raise ValueError(
+                        f"{path} is a link or a device; expected files and folders alone, because a run is "
+                        "also written to. Put what it points to in its place, or delete it."
+                    )
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
@@ -98,7 +142,7 @@ def _parsed(path: Path) -> list[dict[str, Any]]:
             row = json.loads(line)
             if not isinstance(row, dict):
                 raise ValueError("not an object")
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             if number == len(lines):  # no newline behind it: the writer was stopped in the middle
                 break
             raise ValueError(f"{path} line {number} is not a JSON object ({error}).") from error

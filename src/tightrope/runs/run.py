@@ -23,8 +23,10 @@ from tightrope.runs.records import (
     disagreement,
     dumps,
     plain,
+    printable,
     read_json,
     read_lines,
+    refuse_links,
     write_json,
 )
 
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 
 def teller(report: Callable[[str, dict[str, Any]], None]) -> Callable[[str], None]:
     """What tells the user a text through the ``line`` event of a report; a warning when it begins so."""
-    return lambda text: report("line", {"text": text, "warning": text.startswith("warning:")})
+    return lambda text: report("line", {"text": printable(text), "warning": text.startswith("warning:")})
 
 
 class Run:
@@ -79,10 +81,13 @@ class Run:
 
     @classmethod
     def open(cls, path: str | Path, *, tensorboard: bool = False) -> Run:
-        """An existing run folder. Raises ValueError where there is none, naming a near one."""
+        """An existing run folder. Raises ValueError where there is none, naming a near one, and for links
+        inside it.
+        """
         path = Path(path)
         if not (path / "settings.json").is_file():
             raise ValueError(f"{path} is not a run folder: {why_not(path)}")
+        refuse_links(path)
         settings = read_json(path / "settings.json")
         if not isinstance(settings, dict):
             raise ValueError(f"{path / 'settings.json'} holds {type(settings).__name__}, expected an object.")
