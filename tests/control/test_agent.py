@@ -298,7 +298,10 @@ def test_reinforce_masks_unfinished_episodes_without_a_baseline():
     from tightrope.control.collect import finished
 
     ended = np.array([[0, 1, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]], bool)
-    assert finished(ended).tolist() == [[True] * 5 + [False], [False] * 6]
+    whole = np.ones_like(ended)
+    assert finished(ended, whole).tolist() == [[True] * 5 + [False], [False] * 6]
+    whole[0, 4] = False  # the second episode ended in a fault
+    assert finished(ended, whole).tolist() == [[True] * 2 + [False] * 4, [False] * 6]
     agent = tightrope.Reinforce("CartPole-v1", num_envs=2, num_steps=4, baseline=False, seed=0)
     before = parameters(agent).clone()
     reports = list(agent.iterate(8))
