@@ -35,6 +35,7 @@ GROUPS = {
         "keep_checkpoints",
         "tensorboard",
     ),
+    "faults": ("on_env_fault", "max_env_restarts", "env_timeout", "max_rollbacks"),
     "machine": ("vector_backend", "num_workers", "engine", "device", "threads", "compile"),
 }
 
