@@ -65,7 +65,7 @@ def letters(prompts: list[str], completions: list[str], **columns: Any) -> list[
 
 def language(folder: Path, report: Any) -> None:
     """PPO on a random Llama of two layers: value head, reference, KL controller, shuffled prompts."""
-    from tightrope.language.align import align, resume_align
+    from tightrope.language.alignment import align, resume_align
 
     prompts = ["".join(random.Random(k).choices("abcdefghijklmnop", k=1 + k % 5)) for k in range(11)]
     given = {"prompts": prompts, "reward": letters, "report": report}
@@ -374,7 +374,7 @@ def warm(story: str) -> None:
     if story == "language":
         import transformers
 
-        import tightrope.language.align
+        import tightrope.language.alignment
 
         transformers.utils.logging.disable_progress_bar()
     else:

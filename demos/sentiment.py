@@ -210,7 +210,7 @@ def _align(
     values: dict[str, Any], model: str, reward: str, gold: Any, out: Path, prompts: list[str]
 ) -> tuple[Any, float, list[dict[str, Any]]]:
     """Stage three: PPO. Also returns the warnings it gave, and after how many responses."""
-    from tightrope.language.align import align
+    from tightrope.language.alignment import align
     from tightrope.language.display import ALIGN
 
     print("\n3. PPO towards what the reward model prefers, held near the reference by the KL")

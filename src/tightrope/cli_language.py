@@ -92,7 +92,7 @@ def align(words: list[str]) -> int:
             raise UsageError(f"--{name} is missing. For example: {PROGRAM} align {example}")
     _require_transformers()
     from tightrope.language import display
-    from tightrope.language.align import align as run_align
+    from tightrope.language.alignment import align as run_align
 
     def run(report: Any) -> dict[str, Any]:
         return run_align(settings, run_dir=given.get("run_dir"), report=report).summary
@@ -110,7 +110,7 @@ def resume(given: dict[str, Any]) -> int:
             return _resume_supervised(name, given)
     _require_transformers()
     from tightrope.language import display
-    from tightrope.language.align import resume_align
+    from tightrope.language.alignment import resume_align
 
     def run(report: Any) -> dict[str, Any]:
         more = {"prompts": given.get("data"), "reward": given.get("reward"), "gold": given.get("gold")}

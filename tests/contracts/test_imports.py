@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from source_tree import SRC, imports, module_of, name_of, sources, tree
@@ -60,6 +62,14 @@ def test_every_part_has_a_rule():
     """A new folder in the package must be placed among the directions."""
     folders = {path.name for path in SRC.iterdir() if path.is_dir() and list(path.glob("*.py"))}
     assert folders <= set(MAY_IMPORT), folders - set(MAY_IMPORT)
+
+
+@pytest.mark.parametrize("package", ["tightrope", "tightrope.language"])
+def test_no_module_has_the_name_of_something_public(package: str):
+    """Once imported, the module would stand in its place."""
+    module = importlib.import_module(package)
+    modules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
+    assert modules and not modules & set(module.__all__)
 
 
 def test_maths_imports_torch_alone():

@@ -15,7 +15,7 @@ from tightrope.cli import main
 from tightrope.control.resolve import resolve
 from tightrope.control.train import resume, train
 from tightrope.language import align
-from tightrope.language.align import resume_align
+from tightrope.language.alignment import resume_align
 from tightrope.language.settings import AlignSettings, SFTSettings
 from tightrope.language.sft import resume_sft, train_sft
 from tightrope.runs import checkpoint

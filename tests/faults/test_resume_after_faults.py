@@ -14,7 +14,7 @@ from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.control import copies, train, vector
 from tightrope.control.agent import Agent
 from tightrope.language import align
-from tightrope.language.align import resume_align
+from tightrope.language.alignment import resume_align
 from tightrope.language.trainer import Trainer
 from tightrope.runs.run import Run
 

@@ -11,7 +11,7 @@ from language.tiny import padded, saved, tiny_gpt2
 from tightrope.algorithms import ppo
 from tightrope.cli import main
 from tightrope.language import align
-from tightrope.language.align import resume_align
+from tightrope.language.alignment import resume_align
 from tightrope.language.settings import AlignSettings
 from tightrope.language.trunk import Trunk
 

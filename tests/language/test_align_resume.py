@@ -14,7 +14,7 @@ from language.tiny import saved, tiny_llama
 
 from tightrope.cli import main
 from tightrope.language import trainer
-from tightrope.language.align import align, resume_align
+from tightrope.language.alignment import align, resume_align
 from tightrope.language.evaluate import sample_run
 from tightrope.language.trainer import Trainer
 from tightrope.runs import checkpoint, signals

@@ -146,6 +146,14 @@ def test_held_out_examples_are_not_trained_on():
     assert hold_out([1], 0.5, seed=0) == ([1], [])
 
 
+def test_equal_items_are_never_on_both_sides():
+    items = [k % 8 for k in range(24)]
+    own, held = hold_out(items, 0.05, seed=0, group=lambda item: 0)
+    assert len(held) == 3 and not set(own) & set(held)
+    own, held = hold_out([5, 5, 5], 0.3, seed=0)  # nothing else to train on
+    assert len(own) == 2 and len(held) == 1
+
+
 def test_groups_are_held_out_whole_unless_one_is_larger_than_the_share():
     items = [(prompt, i) for prompt in range(40) for i in range(3)]
     own, held = hold_out(items, 0.1, seed=0, group=lambda item: item[0])

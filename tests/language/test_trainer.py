@@ -1,5 +1,6 @@
 """The loop of an alignment run: every part gets what is meant for it, nothing twice and nothing stale."""
 
+import math
 import time
 
 import numpy as np
@@ -8,7 +9,10 @@ import torch
 from language.tiny import saved, tiny_llama
 
 from tightrope.algorithms import ppo
+from tightrope.algorithms.memory import OutOfMemory
 from tightrope.language import lora
+from tightrope.language.alignment import align
+from tightrope.language.answers import RewardError
 from tightrope.language.collect import gather
 from tightrope.language.data import Prompt
 from tightrope.language.fitting import silent
@@ -199,8 +203,72 @@ def test_held_out_prompts_are_answered_as_many_at_a_time_as_a_batch_has(folder, 
         sizes.append(len(prompts)), real(roles, prompts, *more))[1])  # fmt: skip
     settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, held_out_prompts=10)
     made = Trainer(settings, [chr(97 + k % 26) * (1 + k // 26) for k in range(44)], letters, letters, silent)
-    score = made.evaluate()
-    assert sizes == [4, 4, 2] and len(made.held_out) == 10 and 0 <= score <= 1
+    found = made.evaluate()
+    assert sizes == [4, 4, 2] and len(made.held_out) == 10 and 0 <= found["eval/gold"] <= 1
+
+
+def test_what_the_gold_judge_fails_to_score_is_told_and_counted(folder):
+    """Not in silence: the mean is that of a part of the responses."""
+    lines, prompts = [], [chr(97 + k % 26) * (1 + k // 26) for k in range(40)]
+    settings = AlignSettings(model=folder, batch_size=8, max_new_tokens=3, held_out_prompts=8)
+
+    def report(_, event):
+        lines.append(event.get("text", ""))
+
+    def choosy(completions, **_):
+        return [math.nan if k % 4 == 0 else 1.0 for k in range(len(completions))]
+
+    made = Trainer(settings, prompts, letters, choosy, report)
+    for _ in range(2):
+        assert made.evaluate() == {"eval/gold": 1.0, "eval/gold_masked": 2.0}
+    assert sum("gold judge" in line and "choosy" in line for line in lines) == 1
+    made = Trainer(settings, prompts, letters, lambda completions, **_: [None] * len(completions), report)
+    with pytest.raises(RewardError, match="^The gold judge: Not one response"):
+        for _ in range(3):
+            made.evaluate()
+
+
+def test_a_run_without_one_step_says_so(folder, tmp_path):
+    lines = []
+    run = align(
+        model=folder, prompts=["ab", "cd"], reward=lambda completions, **_: [None] * len(completions),
+        total_episodes=8, batch_size=4, max_new_tokens=3, run_dir=tmp_path / "run",
+        report=lambda _, event: lines.append(event.get("text", "")),
+    )  # fmt: skip
+    assert len(run.metrics) == 2 and any("not one step was taken" in line for line in lines)
+
+
+def test_no_reward_is_no_folder(folder):
+    with pytest.raises(ValueError, match="There is no reward"):
+        trainer(folder, reward="")
+
+
+def test_memory_that_is_short_for_scoring_names_the_setting(folder, monkeypatch):
+    made = trainer(folder)
+    monkeypatch.setattr(
+        type(made.judge), "_of_model", lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA"))
+    )
+    with pytest.raises(OutOfMemory, match="--micro-batch-size"):
+        next(made.iterate())
+
+
+def test_memory_that_is_short_for_a_kept_pass_is_told_once(folder, monkeypatch):
+    """From then on no pass is kept: the size says so, and lies in the checkpoint."""
+    from tightrope.language import collect
+
+    lines, looks, whole = [], [], collect._look
+
+    def short(*args):
+        looks.append(torch.is_grad_enabled())
+        if looks[-1]:
+            raise torch.OutOfMemoryError("CUDA")
+        return whole(*args)
+
+    monkeypatch.setattr(collect, "_look", short)
+    made = trainer(folder, minibatch_size=16, total_episodes=48)
+    made.report = lambda _, event: lines.append(event.get("text", ""))
+    assert len(list(made.iterate())) == 3 and looks == [True, False, False, False]
+    assert made.micro_batch_size == 16 and sum("memory ran out" in line for line in lines) == 1
 
 
 def test_the_clock_of_a_run_leaves_evaluations_out(folder):

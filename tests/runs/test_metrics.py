@@ -84,6 +84,7 @@ LANGUAGE = [
     "reward/calibration_error",
     "reward/margin",
     "eval/gold",
+    "eval/gold_masked",
 ]
 
 

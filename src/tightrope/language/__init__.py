@@ -10,7 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tightrope.language.align import align
+    from tightrope.language.alignment import align
     from tightrope.language.evaluate import sample_run
     from tightrope.language.reward_model import load_reward, train_reward
     from tightrope.language.settings import RECIPES, AlignSettings, RewardSettings, SFTSettings
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "align": "align",
+    "align": "alignment",
     "load_reward": "reward_model",
     "sample_run": "evaluate",
     "train_reward": "reward_model",
@@ -42,7 +42,7 @@ def __getattr__(name: str) -> Any:
     if name in __all__:
         home = importlib.import_module(f"tightrope.language.{_HOMES.get(name, 'settings')}")
         value = getattr(home, name)
-        globals()[name] = value  # `align` is a function here, though a module has its name
+        globals()[name] = value
         return value
     raise AttributeError(
         f"module 'tightrope.language' has no attribute {name!r}; it has {', '.join(__all__)}"

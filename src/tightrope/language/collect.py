@@ -51,7 +51,8 @@ class Experience(Answers):
 
     ``logp``, ``ref_logp``, ``entropy``, ``exact`` (KL of the state), ``values``: [B, R]. ``final_values``
     [B]: V of the state after the last token. ``lower`` and ``ref_hidden`` are kept for the epochs that
-    follow, ``said`` for the first one: the same numbers with their gradients.
+    follow, ``said`` for the first one: the same numbers with their gradients; ``short_of_memory`` where they
+    did not fit.
     """
 
     logp: Tensor
@@ -62,6 +63,7 @@ class Experience(Answers):
     final_values: Tensor
     ref_hidden: Tensor | None
     said: Said | None
+    short_of_memory: bool = False
 
     @property
     def last(self) -> Tensor:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tightrope.language.align import settings_from_json
+from tightrope.language.alignment import settings_from_json
 from tightrope.language.data import Prompt, pad_left, read_prompts
 from tightrope.language.models import eos_ids, find_model, load_causal, load_tokenizer
 from tightrope.language.samples import read_samples

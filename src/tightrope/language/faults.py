@@ -1,8 +1,11 @@
-"""Faults of a rollout, said before anything is learned from it: numbers that are not finite, memory."""
+"""Faults of a rollout, said before anything is learned from it: numbers that are not finite, probabilities
+that are not those of sampling, memory.
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -10,7 +13,9 @@ import torch
 
 from tightrope.algorithms.memory import OutOfMemory, free, is_out_of_memory
 from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
+from tightrope.algorithms.optimise import SamplingMismatch
 from tightrope.language.roles import Roles
+from tightrope.language.sampling import log_ratio_limit
 
 if TYPE_CHECKING:
     from tightrope.language.collect import Experience
@@ -34,7 +39,9 @@ def advising_on_memory(function: F) -> F:
                 raise _advice(roles, error) from error
         # outside the except clause, which keeps the failed pass's tensors alive
         free()
-        return advising(roles, *args, **{**how, "keep": False})
+        found = advising(roles, *args, **{**how, "keep": False})
+        found.short_of_memory = True
+        return found
 
     return cast(F, advising)
 
@@ -50,10 +57,12 @@ def _advice(roles: Roles, error: BaseException) -> OutOfMemory:
 
 def refuse_bad_numbers(experience: Experience, roles: Roles) -> None:
     """NonFiniteError when a role gave a number that is not finite; a bad weight is named."""
-    said = (
+    said: tuple[tuple[str, torch.Tensor], ...] = (
         ("log-probability of sampling", experience.responses.logp),
         ("log-probability", experience.logp),
         ("log-probability of the reference", experience.ref_logp),
+        ("entropy", experience.entropy),
+        ("KL to the reference", experience.exact),
         ("value", experience.values),
     )
     mask = experience.responses.mask
@@ -62,6 +71,23 @@ def refuse_bad_numbers(experience: Experience, roles: Roles) -> None:
         return
     weight = first_bad((f"the weight {name}", p) for name, p in roles.named_parameters())
     raise NonFiniteError(
-        f"{found}; expected a finite number{f', but {weight}' if weight else ': the logits overflow'}. "
-        "Nothing was learned from this batch. Look for a learning rate that is too high."
+        f"{found}; expected a finite number, but {weight or 'every weight is one: sums overflow'}. Nothing "
+        "was learned from this batch. Look for a learning rate that is too high."
     )
+
+
+def refuse_mismatch(gap: float, dtype: str, *, first: bool) -> None:
+    """SamplingMismatch when log-probabilities of sampling and of the pass that trains are further apart, in
+    nats, than rounding can be. ``first``: nothing was learned yet.
+    """
+    limit = log_ratio_limit(dtype)
+    # rounding has a tail that grows with the tokens of a run: in bfloat16 the beginning is judged
+    judged = dtype == "float32" or first or not math.isfinite(gap)
+    if judged and not gap <= limit:
+        raise SamplingMismatch(
+            f"The log-probabilities of sampling and of the forward pass that trains differ by {gap:.3g} "
+            f"nats (limit {limit:g} in {dtype}). Likely causes: the model says something else with its KV "
+            "cache than without, layers that look back over a window or were shared wrongly, a module that "
+            "draws random numbers, or too coarse a precision. See tightrope doctor --model, and try --dtype "
+            "float32, or lora_layers left out."
+        )

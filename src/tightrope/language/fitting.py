@@ -167,11 +167,12 @@ def hold_out(
 ) -> tuple[list[Item], list[Item]]:
     """Items to train on and items held out, about ``share`` of them, drawn by the seed; in their order.
 
-    Items of one ``group`` stay together, unless a group is larger than the share. At least one item is held
-    out where there are two or more and the share is above 0.
+    Items of one ``group`` stay together, unless a group is larger than the share; equal items always do,
+    where not all are equal. At least one item is held out where there are two or more and the share is above
+    0.
     """
     left = max(1, round(share * len(items))) if share > 0 and len(items) > 1 else 0
-    keys: list[Hashable] = list(range(len(items)))
+    keys: list[Hashable] = list(items) if len(set(items)) > 1 else list(range(len(items)))
     if group is not None:
         groups: list[Hashable] = [group(item) for item in items]
         keys = groups if max(Counter(groups).values(), default=0) <= left else keys

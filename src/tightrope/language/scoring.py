@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tightrope.algorithms.memory import OutOfMemory, is_out_of_memory
 from tightrope.language import lora
 from tightrope.language.answers import Fault, RewardError
 from tightrope.language.collect import Answers
@@ -44,7 +45,15 @@ class Judge:
     def __call__(self, prompts: Sequence[Prompt], answers: Answers, trainer_state: Any = None) -> Scores:
         """Scores of the responses to ``prompts``, one prompt a response."""
         found = self._of_functions(prompts, answers, trainer_state)
-        learnt = self._of_model(answers)
+        try:
+            learnt = self._of_model(answers)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            raise OutOfMemory(
+                f"Memory is not enough for the reward model to score {len(answers.tokens)} responses. "
+                "Choose a smaller --micro-batch-size or --batch-size."
+            ) from error
         if learnt is not None:
             return with_model(found, learnt, self.weight)
         assert found is not None
@@ -144,6 +153,10 @@ def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: flo
     """
     functions: list[Any] = []
     model, adapter, model_weight = None, None, 1.0
+    if isinstance(reward, str) and not reward:
+        raise ValueError(
+            "There is no reward. Give a function, 'length', FILE.py:function or the folder of a reward model."
+        )
     for entry, weight in map(_weighted, _entries(reward)):
         if is_folder(entry):
             if model is not None or adapter is not None:

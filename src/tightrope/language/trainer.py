@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,8 @@ from torch import Tensor
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch, Evaluation
-from tightrope.algorithms.optimise import SamplingMismatch, make_optimiser, set_learning_rates
+from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
+from tightrope.language.answers import RewardError
 from tightrope.language.collect import (
     Experience,
     PromptOrder,
@@ -30,7 +30,7 @@ from tightrope.language.collect import (
     to_batch,
 )
 from tightrope.language.data import Prompt, hold_out, read_prompts, read_rows
-from tightrope.language.faults import refuse_bad_numbers
+from tightrope.language.faults import refuse_bad_numbers, refuse_mismatch
 from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.models import context_length, find_model
@@ -149,8 +149,11 @@ class Trainer:
             save_model(self.roles, run.path, settings)
             summary = self._summary(run, self.newest)
             run.finish(summary)
+        rows = run.read_metrics()
+        if rows and not any("train/minibatches" in row for row in rows):
+            self._warn("not one step was taken: no response had a score that counts. The model is as it was.")
         self.report("finish", summary)
-        return Aligned(run.path, summary, run.read_metrics())
+        return Aligned(run.path, summary, rows)
 
     def _next_prompts(self) -> int:
         """Prompts of the next iteration; 0 at the end of the budget."""
@@ -195,7 +198,10 @@ class Trainer:
 
     def _one_iteration(self, prompts: Sequence[Prompt]) -> tuple[dict[str, float], list[dict[str, Any]]]:
         """sample -> score -> advantages -> update."""
-        settings, begin = self.settings, time.perf_counter()
+        settings, gold = self.settings, dict[str, float]()
+        if self.gold is not None and (not self.episodes or self._reached(settings.evaluate_every)):
+            gold = self.evaluate()  # of the policy whose KL this rollout tells
+        begin = time.perf_counter()
         present = settings.update.at(self.episodes / settings.total_episodes)
         set_learning_rates(self.optimiser, present)
         stream = settings.seed + 2**40 * self.rollbacks  # not the numbers that led to a NaN
@@ -204,6 +210,8 @@ class Trainer:
         )
         given = (stream, self.iteration, settings.samples_per_prompt)
         experience = gather(self.roles, prompts, *given, keep=keep)
+        if experience.short_of_memory:
+            self._smaller(len(experience.tokens))
         refuse_bad_numbers(experience, self.roles)
         gathered = time.perf_counter()
         asked = [prompt for prompt in prompts for _ in range(settings.samples_per_prompt)]
@@ -216,10 +224,8 @@ class Trainer:
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
         batch = to_batch(experience, rewards, valid, settings)
         share = kl_share(experience, settings, self.kl_beta)
-        metrics = describe(experience, scores, rewards, share, valid) | scores.metrics
-        self._check_sampling(metrics["objective/sampling_gap"])
-        if self.gold is not None and (not self.episodes or self._reached(settings.evaluate_every)):
-            metrics["eval/gold"] = self.evaluate()  # of the policy whose KL this rollout tells
+        metrics = describe(experience, scores, rewards, share, valid) | scores.metrics | gold
+        refuse_mismatch(metrics["objective/sampling_gap"], settings.dtype, first=not self.iteration)
         self._watch(metrics)
         judged = time.perf_counter()
         if len(batch) and not self.stopped:
@@ -268,12 +274,16 @@ class Trainer:
             model, self.optimiser, batch, present, self.update_rng, extra_loss=extra, log_ratio_limit=limit
         )
         if "train/micro_batch_size" in metrics:
-            self.micro_batch_size = int(metrics["train/micro_batch_size"])
-            self._warn(
-                f"memory ran out; from now on {self.micro_batch_size} responses a pass, the gradient is the "
-                f"same. Say --micro-batch-size {self.micro_batch_size} to begin with it."
-            )
+            self._smaller(int(metrics["train/micro_batch_size"]))
         return metrics
+
+    def _smaller(self, size: int) -> None:
+        """Memory ran out: ``size`` responses a pass from now on."""
+        self.micro_batch_size = size
+        self._warn(
+            f"memory ran out; from now on {size} responses a pass, and none is kept for the update. The "
+            f"gradient is the same. Say --micro-batch-size {size} to begin with it."
+        )
 
     def _extra_loss(self, kl_weight: float) -> Any:
         """The KL's share in the loss and the pretraining loss; None when neither is asked for."""
@@ -297,25 +307,12 @@ class Trainer:
 
         return extra if not form.endswith("reward") or pretraining is not None else None
 
-    def _check_sampling(self, gap: float) -> None:
-        limit = log_ratio_limit(self.settings.dtype)
-        # rounding has a tail that grows with the tokens of a run: in bfloat16 the beginning is judged
-        judged = self.settings.dtype == "float32" or not self.iteration or not math.isfinite(gap)
-        if judged and not gap <= limit:
-            raise SamplingMismatch(
-                f"The log-probabilities of sampling and of the forward pass that trains differ by {gap:.3g} "
-                f"nats (limit {limit:g} in {self.settings.dtype}). Likely causes: the model says something "
-                "else with its KV cache than without, layers that look back over a window or were shared "
-                "wrongly, a module that draws random numbers, or too coarse a precision. See tightrope "
-                "doctor --model, and try --dtype float32, or lora_layers left out."
-            )
-
-    def _tell_faults(self, scores: Any) -> None:
+    def _tell_faults(self, scores: Any, judge: str = "") -> None:
         """Say once a run for each function and kind why samples are left out; the count is a metric."""
         for fault in scores.faults:
-            if (fault.function, fault.kind) not in self._told:
-                self._told.add((fault.function, fault.kind))
-                self._warn(fault.text)
+            if (judge + fault.function, fault.kind) not in self._told:
+                self._told.add((judge + fault.function, fault.kind))
+                self._warn(judge + fault.text)
 
     def _trainer_state(self) -> SimpleNamespace:
         """What TRL's reward functions may look at: iterations so far and in all, passes over the prompts."""
@@ -326,14 +323,21 @@ class Trainer:
             episode=self.episodes,
         )
 
-    def evaluate(self) -> float:
-        """The mean gold score of responses to held-out prompts, sampled as in training, as many at a time."""
+    def evaluate(self) -> dict[str, float]:
+        """The mean gold score of responses to held-out prompts, sampled as in training, as many at a time;
+        and how many of them the judge gave no score.
+        """
         assert self.gold is not None
         size, seed, found = self.settings.batch_size, self.settings.seed + 1_000_003, list[np.ndarray]()
         for number, start in enumerate(range(0, len(self.held_out), size)):
             prompts = self.held_out[start : start + size]
             answers = respond(self.roles, prompts, seed, number, 1)
-            scores = self.gold(prompts, answers, self._trainer_state())
+            try:
+                scores = self.gold(prompts, answers, self._trainer_state())
+            except RewardError as error:
+                raise RewardError(f"The gold judge: {error}") from error
+            self._tell_faults(scores, "the gold judge: ")
             found.append(scores.total[scores.valid])
         judged = np.concatenate(found)
-        return float(judged.mean()) if len(judged) else float("nan")
+        mean = float(judged.mean()) if len(judged) else float("nan")
+        return {"eval/gold": mean, "eval/gold_masked": float(len(self.held_out) - len(judged))}

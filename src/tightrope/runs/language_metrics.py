@@ -169,4 +169,5 @@ LANGUAGE_TABLE = (
         "follows.",
         negative=True,
     ),
+    metric("eval/gold_masked", "responses", "down", "Of these, how many the gold judge gave no score."),
 )
