@@ -51,6 +51,7 @@ def run(folder: Path, name: str) -> None:
     stages = folder / ("stages-smollm2" if name == "smollm2" else "stages")
     command = [sys.executable, str(DEMO), "--stages", str(stages), "--out", str(folder / name)]
     command += ["--threads", "1", "--json", str(result), *JOBS[name]]
+    command += [] if name == "smollm2" else ["--evaluate-every", "0.025"]
     with open(folder / f"{name}.log", "w", encoding="utf-8") as log:
         subprocess.run(command, env=our_environment() | {"OMP_NUM_THREADS": "1"}, stdout=log, check=True)
 

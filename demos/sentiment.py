@@ -39,7 +39,7 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
         },
         "align": {
             "total_episodes": 7168, "batch_size": 128, "minibatch_size": 32, "learning_rate": 1e-3,
-            "kl_beta": 0.1, "lora_rank": 32, "lora_layers": 2, "evaluate_every": 0.025,
+            "kl_beta": 0.1, "lora_rank": 32, "lora_layers": 2, "evaluate_every": 0.1,
             "held_out_prompts": 256,
         },
     },
@@ -143,6 +143,9 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument(
         "--stages", type=Path, help="folder of an earlier run whose SFT and reward model are used"
     )
+    parser.add_argument(
+        "--evaluate-every", type=float, help="fraction of PPO between looks of the gold judge"
+    )
     parser.add_argument("--json", type=Path, help="write figures and curve here")
     options = parser.parse_args(words)
     out = options.out or Path("runs") / f"sentiment-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -163,6 +166,8 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     )
     if options.kl_beta is not None:
         values |= {"kl_beta": options.kl_beta, "kl_goal": None}
+    if options.evaluate_every is not None or options.kl_beta == 0:  # the monitor needs a dense curve
+        values["evaluate_every"] = options.evaluate_every or 0.025
     kept = len(for_prompts) // 5  # reviews whose beginnings PPO never sees
     run, seconds, alarms = _align(values, model, reward, gold, out, openings(for_prompts[kept:], 4000))
     return _summary(options, run, seconds, alarms, gold, openings(for_prompts[:kept], JUDGED))

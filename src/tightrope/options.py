@@ -257,12 +257,14 @@ def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
 def read_settings(path: str) -> Any:
     """What a settings.json holds, given as the file or as the folder of its run. UsageError for neither."""
     from tightrope.runs.records import read_json
+    from tightrope.runs.signed import unsigned
 
     file = Path(path)
     file = file / "settings.json" if file.is_dir() else file
     if not file.is_file():
         raise UsageError(f"--settings {path}: there is no such file. Give RUN/settings.json.")
-    return read_json(file)
+    found = read_json(file)
+    return unsigned(found) if isinstance(found, dict) else found
 
 
 def overrides(given: Options, file_values: Options) -> tuple[str, Options]:

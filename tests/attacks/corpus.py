@@ -80,11 +80,13 @@ def found(folder: Path, name: str) -> Path:
 
 
 def edit(name: str, **values: Any) -> Callable[[Path], None]:
-    """Change keys of a JSON object in the folder; a value that is a dict is merged into the one there."""
+    """Change keys of a JSON object in the folder; a value that is a dict is merged into the one there. Its
+    own hash, which anybody can write, is taken out.
+    """
 
     def plant(folder: Path) -> None:
         path = found(folder, name)
-        path.write_text(json.dumps(merged(json.loads(path.read_text()), values)))
+        path.write_text(json.dumps(merged(json.loads(path.read_text()), {"sha256": ..., **values})))
 
     return plant
 

@@ -1,10 +1,14 @@
 """A fault of an environment is named in full and bounded in time, or survived by making it anew."""
 
+import contextlib
 import json
 import multiprocessing
 import os
 import re
+import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -20,6 +24,9 @@ from tightrope.cli import main
 from tightrope.control.collect import BadNumbers
 from tightrope.control.environments import EnvironmentFault, make_environments
 from tightrope.control.faults import FaultPolicy, pause, renewed_seed
+from tightrope.control.resolve import resolve
+from tightrope.control.train import resume, train
+from tightrope.runs.checkpoint import step_of
 
 SMALL = {"num_envs": 4, "num_steps": 16, "minibatch_size": 32, "num_epochs": 1, "seed": 5}
 AT = 5
@@ -49,6 +56,11 @@ class Frail(gym.Env):
         if self.mine and self.t == AT:
             if self.how == "raise":
                 raise RuntimeError("the simulator broke")
+            if self.how == "leave":
+                raise SystemExit(0)
+            while self.how == "stubborn":
+                with contextlib.suppress(Exception):  # as a simulator's client that connects again
+                    time.sleep(600)
             if self.how == "exit":
                 os._exit(7)
             if self.how == "kill":
@@ -113,6 +125,8 @@ def nothing_is_left_behind():
 
 WORDS = {
     "raise": "RuntimeError: the simulator broke",
+    "leave": "raised SystemExit: 0",
+    "stubborn": r"not (back after|answered for) 0.5 s \(env_timeout\)",
     "exit": r"has died \(exit code 7\)",
     "kill": r"has died \(exit code -9\)",
     "hang": r"not (back after|answered for) 0.5 s \(env_timeout\)",
@@ -124,7 +138,7 @@ WORDS = {
 @pytest.mark.parametrize(
     ("how", "backend", "engine"),
     [(how, "workers", "torch") for how in WORDS]
-    + [(how, "serial", "torch") for how in ("raise", "hang", "shape", "tuple")]
+    + [(how, "serial", "torch") for how in ("raise", "leave", "hang", "stubborn", "shape", "tuple")]
     + [("raise", "serial", "fused"), ("kill", "workers", "fused")],
 )
 def test_every_fault_names_environment_worker_step_seed_and_action(how, backend, engine, agent_on):
@@ -337,6 +351,86 @@ def test_a_fault_while_a_state_is_kept_is_named_and_ends_the_run(how, backend, w
         environments.step(np.zeros((4, 1), np.float32))
         with pytest.raises(EnvironmentFault, match=words.replace("worker 1", "worker [12]")):
             environments.set_state(environments.get_state())
+
+
+class Choosy(Keeper):
+    """Cannot be reset with the seed that copy 3 begins with."""
+
+    def reset(self, *, seed=None, options=None):
+        if seed == SMALL["seed"] + 3:
+            raise OSError("no display")
+        return super().reset(seed=seed)
+
+
+@pytest.mark.parametrize("backend", ["serial", "workers"])
+def test_faults_of_the_first_resets_are_not_counted_again_on_a_resume(backend, tmp_path):
+    number = {"num_workers": 2} if backend == "workers" else {}
+    values = {**SMALL, **number, "vector_backend": backend, "on_env_fault": "restart", "max_env_restarts": 1}
+    values |= {"total_steps": 192, "checkpoint_every": 0.3, "evaluate_every": None}
+    rows = []
+    for name in ("whole", "broken"):
+        run = tmp_path / name
+        settings = resolve(lambda: Choosy("none"), "ppo", values)
+        train(settings, run_dir=run, env=lambda: Choosy("none"))
+        if name == "broken":
+            for later in sorted((run / "checkpoints").iterdir(), key=step_of)[1:]:
+                shutil.rmtree(later)
+            resume(run, env=lambda: Choosy("none"))
+        found = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        rows.append([{k: v for k, v in row.items() if "time" not in k and k != "seconds"} for row in found])
+    assert rows[0] == rows[1]
+    assert [row["rollout/environment_restarts"] for row in rows[0]] == [1.0, 0.0, 0.0]
+
+
+# ------------------------------------------------------------------------------- the end of the processes
+
+
+def test_hung_workers_are_ended_side_by_side():
+    policy = FaultPolicy(False, 0, None)
+    environments = make_environments(
+        lambda: Frail("hang", always=True), 9, backend="workers", num_workers=9, policy=policy
+    )
+    environments.reset(SMALL["seed"])
+    for worker in environments._copies._workers:
+        for _ in range(AT):
+            worker.tell(b"s")
+    time.sleep(0.5)
+    begin = time.monotonic()
+    environments.close()
+    assert time.monotonic() - begin < 6
+
+
+ORPHANS = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from faults.test_environment_faults import make_agent
+make_agent("hang", always=True, env_timeout=None).learn(1000)
+"""
+
+
+def test_a_worker_that_hangs_does_not_outlive_its_parent():
+    tests = str(Path(__file__).parent.parent)
+    process = subprocess.Popen([sys.executable, "-c", ORPHANS, tests], start_new_session=True)
+    task, workers = Path(f"/proc/{process.pid}/task/{process.pid}/children"), list[str]()
+    until = time.monotonic() + 60
+    while not workers and time.monotonic() < until:
+        workers = task.read_text().split()
+        time.sleep(0.1)
+    time.sleep(2.0)  # by now it hangs
+    process.kill()
+    process.wait()
+    until = time.monotonic() + 10
+    while any(alive(pid) for pid in workers) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert workers and not any(alive(pid) for pid in workers)
+
+
+def alive(pid):
+    """Whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 # --------------------------------------------------------------------------------- vector environments

@@ -31,8 +31,26 @@ def strict(text: str) -> object:
 
 def test_settings_are_there_before_the_first_step(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", SETTINGS, "name")
-    assert json.loads((run.path / "settings.json").read_text()) == {**SETTINGS, "hidden": [64, 64]}
-    assert Run.open(run.path).settings == run.settings
+    found = json.loads((run.path / "settings.json").read_text())
+    assert found.pop("sha256") and found == {**SETTINGS, "hidden": [64, 64]}
+    assert Run.open(run.path, own=True).settings == run.settings
+
+
+def test_a_changed_digit_of_the_settings_is_found(tmp_path: Path) -> None:
+    """Readers may look at them; whoever goes on with the run may not."""
+    run = Run.create(tmp_path / "a", {"clip": 0.25, "steps": 3000, "lr": 1e-3}, "name")
+    file = run.path / "settings.json"
+    text, found = file.read_text(), 0
+    for place, letter in enumerate(text):
+        if letter.isdigit() and place < text.index("sha256"):
+            file.write_text(text[:place] + str((int(letter) + 1) % 10) + text[place + 1 :])
+            with pytest.raises(ValueError, match=r"settings.json is not as the run wrote it.*--settings"):
+                Run.open(run.path, own=True)
+            assert "sha256" not in Run.open(run.path).settings
+            found += 1
+    assert found >= 7
+    run.update_settings({"steps": 7000})
+    assert Run.open(run.path, own=True).settings == {"steps": 7000}
 
 
 def test_default_folders_differ_and_are_safe_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,7 +112,10 @@ class Collector:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on with the episodes of a `state`. ValueError for one of other environments."""
+        restarts = self.environments.restarts
+        self.environments.count_from(0)  # the resets of then, and what failed in them, come once more
         inputs, action_mask = self.environments.set_state(state["environments"])
+        self.environments.count_from(restarts)
         zeros = np.zeros(self.environments.num_envs)
         like = {"_inputs": inputs, "_action_mask": action_mask, "_returns": zeros}
         for name, fresh in {**like, "_lengths": zeros.astype(np.int64)}.items():

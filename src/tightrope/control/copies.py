@@ -272,6 +272,7 @@ class EnvCopies:
     def _stop_workers(self) -> None:
         for worker in self._workers:
             worker.ask_to_stop()
+        until = time.monotonic() + 2.0  # for all of them: a run that is asked to stop has ten seconds
         for worker in self._workers:
-            worker.stop()
+            worker.stop(max(0.0, until - time.monotonic()))
         self._workers = []

@@ -52,8 +52,12 @@ class ApiBreak(Exception):
     """What an environment gave that Gymnasium's API does not allow; becomes an EnvironmentFault."""
 
 
-class Overdue(Exception):
-    """An environment of this process was not back in time."""
+class Overdue(BaseException):
+    """An environment of this process was not back in time; no ``except Exception`` of its own holds it."""
+
+
+# what counts as an environment's fault: a signal to this process does not
+RAISED = (Exception, SystemExit, GeneratorExit, Overdue)
 
 
 class FaultPolicy(NamedTuple):
@@ -101,7 +105,7 @@ def action_text(action: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def raised_here(error: Exception) -> bool:
+def raised_here(error: BaseException) -> bool:
     """True when the innermost frame is this library's: an answer could not be used, no environment raised."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = Path(__file__).parent

@@ -18,6 +18,7 @@ from gymnasium.vector import VectorEnv
 from tightrope.control import states
 from tightrope.control.autoreset import VectorCopies
 from tightrope.control.faults import (
+    RAISED,
     ApiBreak,
     EnvironmentFault,
     FaultPolicy,
@@ -65,7 +66,7 @@ class GuardedVector:
         self._seed, self._count, self._renewals = seed, 0, 0
         try:
             return self._reset(seed)
-        except Exception as error:
+        except RAISED as error:
             return self._renew(error)
 
     def _reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
@@ -114,7 +115,7 @@ class GuardedVector:
                     if found is not None and "flat" in found:
                         check_finite(what, found["flat"])
             return step
-        except Exception as error:
+        except RAISED as error:
             self._busy = False
             inputs, masks = self._renew(error)
             nothing, none = np.zeros(self._copies.num_envs), np.zeros(self._copies.num_envs, bool)
@@ -122,7 +123,7 @@ class GuardedVector:
         finally:
             self._busy = False
 
-    def _renew(self, error: Exception) -> tuple[Inputs, np.ndarray | None]:
+    def _renew(self, error: BaseException) -> tuple[Inputs, np.ndarray | None]:
         """Another vector environment after a fault, as often as the policy allows; else raise the fault."""
         fault = self._fault(error)
         if not self.policy.restart or self._anew is None:
@@ -136,10 +137,10 @@ class GuardedVector:
             try:
                 self._copies.renew(self._anew, seed)
                 return self._reset(seed)
-            except Exception as again:
+            except RAISED as again:
                 error, fault = again, self._fault(again)
 
-    def _fault(self, error: Exception) -> EnvironmentFault:
+    def _fault(self, error: BaseException) -> EnvironmentFault:
         name, action = self._copies.name, action_text(self._actions.tolist()) if self._count else None
         where = f"the vector environment {name} at step {self._count}"
         index = -1

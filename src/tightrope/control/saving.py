@@ -94,7 +94,7 @@ def name_again(path: str | Path, env: str, command: str) -> str:
     words = f"tightrope {command} {shlex.quote(str(path))} --env {retyped(env, 'ID')}{registered}"
     return (
         f"{path} was trained on {env!r}, a task of somebody's own code, which no file may import. If it is "
-        f"yours, or you have read it, name it again: {words}."
+        f"yours, or you have read it, name it again:\n{words}"
     )
 
 
@@ -141,7 +141,7 @@ def restore(agent: Agent, tensors: dict[str, dict[str, torch.Tensor]], state: di
     beta = state["kl_beta"]
     agent.steps, agent.kl_beta = int(state["steps"]), None if beta is None else float(beta)
     agent.rollbacks = int(state.get("rollbacks", 0))  # none in a run begun before they were
-    agent.collector.count_from(int(state.get("environment_restarts", 0)))
+    agent.collector.count_from(max(0, int(state.get("environment_restarts", 0))))
     agent.sampling_rng.bit_generator.state = state["rng"]["sampling"]
     agent.update_rng.bit_generator.state = state["rng"]["update"]
 

@@ -22,7 +22,7 @@ from tightrope.control.saving import (
 )
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import signals
-from tightrope.runs.checkpoint import understood
+from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.grid import crosses
 from tightrope.runs.history import steps_in
@@ -77,12 +77,20 @@ def resume(
 
     ``total_steps`` extends a finished run: schedules and grid run over the new budget from here on.
     """
-    with Run.open(run_dir).lock() as run:
+    with Run.open(run_dir, own=True).lock() as run:
         return _resume(run, total_steps, report, env, policy)
 
 
 def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, policy: Any) -> dict[str, Any]:
     run_dir = run.path
+    if not steps_in(run.checkpoints) and run.read_metrics():
+        report(
+            "line",
+            {
+                "text": f"warning: {run_dir} has rows and no checkpoint; it begins at step 0 again.",
+                "warning": True,
+            },
+        )
     point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
@@ -109,6 +117,8 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
     if point is not None:
         with understood(point.folder):
             restore(agent, point.tensors, state)
+            if agent.steps != step_of(point.folder):
+                raise ValueError(f"its steps are {agent.steps}, its name says {step_of(point.folder)}")
             lines = resume_episodes(agent, state)
         for line in lines:
             report("line", {"text": line})

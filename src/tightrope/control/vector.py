@@ -18,6 +18,7 @@ import numpy as np
 
 from tightrope.control import states
 from tightrope.control.faults import (
+    RAISED,
     ApiBreak,
     EnvironmentFault,
     FaultPolicy,
@@ -91,7 +92,7 @@ class EnvGroup:
                 self._seeds[row] = self._seed_of(row)
                 try:
                     self._begin(row)
-                except Exception as error:
+                except RAISED as error:
                     self._renew(row, error)
             if self.has_masks:
                 self._check_masks()
@@ -167,7 +168,7 @@ class EnvGroup:
                     self._check_row(row, self._rows)
                 if has_masks:
                     self._store_mask(row, observation, info)
-        except Exception as error:
+        except RAISED as error:
             self._renew(row, error)
             return row + 1
         return len(self.envs)
@@ -176,7 +177,7 @@ class EnvGroup:
         if "flat" in rows[row]:
             check_finite(what, rows[row]["flat"][0])
 
-    def _renew(self, row: int, error: Exception) -> None:
+    def _renew(self, row: int, error: BaseException) -> None:
         """Make a copy anew after a fault, as often as the policy allows; else raise what happened.
 
         The step in which it failed did not take place (``slots.cut``), unless only the reset after it failed.
@@ -198,7 +199,7 @@ class EnvGroup:
                 self._replace(row)
                 self._begin(row)
                 break
-            except Exception as again:
+            except RAISED as again:
                 error, fault = again, self._fault(row, again)
         if not whole and self._count:
             slots.cut[row], slots.rewards[row] = True, 0.0
@@ -230,7 +231,7 @@ class EnvGroup:
         self.slots.under_way[0] = row
         try:
             return function(*arguments)
-        except Exception as error:
+        except RAISED as error:
             what = f"the state of environment {self.first + row} ({self.name}) cannot be kept"
             message = f"{what}: {type(error).__name__}: {error}."
             facts: dict[str, Any] = {"env_id": self.name, "worker": self.worker}
@@ -290,7 +291,7 @@ class EnvGroup:
         while len(blocked := self.action_layout.blocked_rows(self.slots.masks)):
             self._renew(int(blocked[0]), ApiBreak("the action mask forbids every choice; allow at least one"))
 
-    def _fault(self, row: int, error: Exception) -> EnvironmentFault:
+    def _fault(self, row: int, error: BaseException) -> EnvironmentFault:
         """The error of one copy in words; an environment's own exception brings its traceback along."""
         index, seed = self.first + row, self._seeds[row]
         action = action_text(_nth(self.action_layout.rows(self.slots.actions), row)) if self._count else None

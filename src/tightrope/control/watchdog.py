@@ -76,8 +76,8 @@ class Watchdog:
                 told = True
                 print(
                     f"{self._name} has not answered for {clock - since:.0f} s and cannot be interrupted: it "
-                    "is in compiled code of this process. End the process; vector_backend workers steps "
-                    "copies where they can be stopped.",
+                    "is in compiled code of this process, or swallows what interrupts it. End the process; "
+                    "vector_backend workers steps copies where they can be stopped.",
                     file=sys.stderr,
                 )
             elif clock - since >= self._timeout and self._late is None:

@@ -15,6 +15,7 @@ import signal
 import socket
 import struct
 import sys
+import threading
 import time
 import traceback
 import warnings
@@ -28,7 +29,7 @@ import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from tightrope.control import states
-from tightrope.control.faults import EnvironmentFault, FaultPolicy
+from tightrope.control.faults import RAISED, EnvironmentFault, FaultPolicy
 from tightrope.control.slots import Slots
 from tightrope.control.tasks import make_all
 from tightrope.control.vector import EnvGroup
@@ -180,9 +181,9 @@ class Worker:
         with contextlib.suppress(OSError):
             self._socket.sendall(COMMAND.pack(b"c", 0))
 
-    def stop(self) -> None:
-        """Wait for the worker to end, and end it when it does not."""
-        self._process.join(2.0)
+    def stop(self, patience: float = 2.0) -> None:
+        """Wait so many seconds for the worker to end, and end it when it does not."""
+        self._process.join(patience)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
@@ -221,6 +222,7 @@ def _work(
         _parent_ends
     ):  # else this process would keep other workers from seeing their parent die
         inherited.close()
+    threading.Thread(target=_outlive_nobody, args=(os.getppid(),), daemon=True).start()
     envs: list[gym.Env] = []
     try:
         make_all(makers.fn, envs)
@@ -233,7 +235,7 @@ def _work(
             channel.sendall((MASKED if group.has_masks else READY) + more)
     except (ConnectionError, EOFError):
         pass  # the parent is gone
-    except Exception as error:
+    except RAISED as error:
         text = f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
         failed = EnvironmentFault(
             f"making copies of {name} in a worker failed: {text}", first, env_id=name, worker=number
@@ -247,6 +249,13 @@ def _work(
             with contextlib.suppress(Exception):
                 env.close()
         channel.close()
+
+
+def _outlive_nobody(parent: int) -> None:
+    """End this process soon after its parent, even while an environment hangs."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
 
 
 def _obey(channel: socket.socket, group: EnvGroup, spin: float) -> bytes | None:

@@ -93,7 +93,7 @@ def resume_align(
     Code is never named by a file: a reward that was a function must be given again, and prompts that were no
     file too. ``total_episodes`` extends a finished run.
     """
-    run = Run.open(run_dir)
+    run = Run.open(run_dir, own=True)
     settings = settings_from_json(run.settings)
     if total_episodes is not None:
         settings = settings.with_values(total_episodes=total_episodes)

@@ -39,7 +39,7 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
     ValueError when it is another command's, or when something that was an object is not given; RunInUse when
     it has another writer.
     """
-    run = Run.open(run_dir)
+    run = Run.open(run_dir, own=True)
     unknown = sorted(set(run.settings) - {field.name for field in dataclasses.fields(kind)})
     if unknown:
         raise ValueError(f"{run_dir} has settings that {kind.__name__} has not: {', '.join(unknown)}.")

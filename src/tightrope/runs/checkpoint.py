@@ -82,7 +82,7 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
             "step": step_of(folder) if step_of(folder) >= 0 else None,
             "files": files,
             "versions": versions.known(),
-            "settings_sha256": _hash(state["settings"]) if "settings" in state else None,
+            "settings_sha256": fingerprint(state["settings"]) if "settings" in state else None,
         }
         write_file(temporary / "manifest.json", [_manifest_text(manifest)], sync=False)
     return folder
@@ -91,10 +91,11 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
 def _manifest_text(manifest: dict[str, Any]) -> bytes:
     """The one text of a manifest, the hash of its content in it."""
     bare = {name: value for name, value in manifest.items() if name != "sha256"}
-    return (dumps({**bare, "sha256": _hash(bare)}, indent=2) + "\n").encode("utf-8")
+    return (dumps({**bare, "sha256": fingerprint(bare)}, indent=2) + "\n").encode("utf-8")
 
 
-def _hash(value: Any) -> str:
+def fingerprint(value: Any) -> str:
+    """The SHA-256 of the canonical JSON of a value."""
     return hashlib.sha256(canonical(value)).hexdigest()
 
 

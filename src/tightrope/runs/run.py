@@ -29,6 +29,7 @@ from tightrope.runs.records import (
     refuse_links,
     write_json,
 )
+from tightrope.runs.signed import require_own, signed, unsigned
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -75,14 +76,14 @@ class Run:
                 durable.make_folders(path)
         run = cls(path, plain(settings)).lock()
         require_free(path)  # nobody has taken it before the lock was ours
-        write_json(path / "settings.json", run.settings)
+        write_json(path / "settings.json", signed(run.settings))
         run._tensorboard = writer_class(str(path / "tensorboard")) if writer_class else None
         return run
 
     @classmethod
-    def open(cls, path: str | Path, *, tensorboard: bool = False) -> Run:
+    def open(cls, path: str | Path, *, tensorboard: bool = False, own: bool = False) -> Run:
         """An existing run folder. Raises ValueError where there is none, naming a near one, and for links
-        inside it.
+        inside it; with ``own`` also when settings.json is not as the run wrote it.
         """
         path = Path(path)
         if not (path / "settings.json").is_file():
@@ -91,6 +92,9 @@ class Run:
         settings = read_json(path / "settings.json")
         if not isinstance(settings, dict):
             raise ValueError(f"{path / 'settings.json'} holds {type(settings).__name__}, expected an object.")
+        if own:
+            require_own(path / "settings.json", settings)
+        settings = unsigned(settings)
         return cls(path, settings, _summary_writer()(str(path / "tensorboard")) if tensorboard else None)
 
     def lock(self) -> Run:
@@ -301,7 +305,7 @@ class Run:
         """Replace settings.json: a resumed run may go on under another budget."""
         self.lock()
         self.settings = plain(settings)
-        write_json(self.path / "settings.json", self.settings)
+        write_json(self.path / "settings.json", signed(self.settings))
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Write summary.json, the sign of a run that came to its end, and close the files."""

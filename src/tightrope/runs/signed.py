@@ -1,0 +1,29 @@
+"""settings.json carries the SHA-256 of the rest of it: a resume with another digit is another run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tightrope.runs.checkpoint import fingerprint
+
+KEY = "sha256"
+
+
+def signed(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings and their hash."""
+    return {**settings, KEY: fingerprint(settings)}
+
+
+def unsigned(found: dict[str, Any]) -> dict[str, Any]:
+    """The settings alone."""
+    return {name: value for name, value in found.items() if name != KEY}
+
+
+def require_own(file: Path, found: dict[str, Any]) -> None:
+    """ValueError when what was read from ``file`` is not as it was signed; what bears no hash is let pass."""
+    if KEY in found and found[KEY] != fingerprint(unsigned(found)):
+        raise ValueError(
+            f"{file} is not as the run wrote it: its sha256 is that of other settings, and the end would be "
+            f"another run's. Put it back, or begin a new run of these settings: --settings {file}"
+        )
