@@ -7,8 +7,9 @@ import torch
 from language.tiny import VOCABULARY, padded, saved
 
 from tightrope.algorithms.optimise import SamplingMismatch
-from tightrope.language import AlignSettings, heads, selfcheck
+from tightrope.language import heads, selfcheck
 from tightrope.language.data import Example
+from tightrope.language.faults import refuse_mismatch
 from tightrope.language.ledger import Job, ledger, reward_model_bytes
 from tightrope.language.models import attention_window, load_causal, parts
 from tightrope.language.packing import collate, row_of
@@ -16,7 +17,6 @@ from tightrope.language.reward_model import load_reward
 from tightrope.language.sampling import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample
 from tightrope.language.sft import require_packable, token_loss
 from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.language.trainer import Trainer
 from tightrope.language.trunk import Trunk
 
 COMMON = {
@@ -184,24 +184,18 @@ def test_a_reward_model_without_fused_attention_loads(tmp_path):
 
 
 @pytest.mark.parametrize(("dtype", "limit"), [("float32", LOG_RATIO_LIMIT), ("bfloat16", LOWERED_LIMIT)])
-def test_sampling_and_training_may_differ_by_rounding_alone_in_every_precision(dtype, limit, tmp_path):
-    settings = AlignSettings(
-        model=saved(tmp_path), dtype=dtype, batch_size=4, max_prompt_tokens=8, max_new_tokens=4
-    )
-    trainer = Trainer(settings, ["ab", "cd"], lambda completions, **more: [0.0] * len(completions), None,
-                      lambda event, data: None)  # fmt: skip
-    trainer._check_sampling(limit)
+def test_sampling_and_training_may_differ_by_rounding_alone_in_every_precision(dtype, limit):
+    refuse_mismatch(limit, dtype, first=True)
     for gap in (limit * 1.01, float("nan")):
         with pytest.raises(SamplingMismatch, match=r"KV cache.*window"):
-            trainer._check_sampling(gap)
-    trainer.iteration = 1
+            refuse_mismatch(gap, dtype, first=True)
     if dtype == "float32":
         with pytest.raises(SamplingMismatch):
-            trainer._check_sampling(limit * 1.01)
+            refuse_mismatch(limit * 1.01, dtype, first=False)
     else:
-        trainer._check_sampling(limit * 1.01)  # one token of many, late in a run
+        refuse_mismatch(limit * 1.01, dtype, first=False)  # one token of many, late in a run
     with pytest.raises(SamplingMismatch):
-        trainer._check_sampling(float("nan"))
+        refuse_mismatch(float("nan"), dtype, first=False)
 
 
 def test_sampling_from_a_scaled_model_is_not_from_its_head(tmp_path):

@@ -75,7 +75,7 @@ def load(
         )
     if env is None and own_environment:
         again = name_again(path, settings.env, "evaluate")
-        raise ValueError(f"{again} In Python: load({str(path)!r}, env=...).")
+        raise ValueError(f"{again}\nIn Python: load({str(path)!r}, env=...)")
     if env is not None:
         name, rows = (
             env if isinstance(env, str) else settings.env,
