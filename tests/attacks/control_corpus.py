@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 import shutil
 import sys
@@ -25,9 +24,10 @@ from attacks.corpus import (
     pickled,
     pipe,
     put,
+    staged,
     twice,
 )
-from attacks.watch import MARK, Watch, outcome
+from attacks.watch import MARK, Watch
 
 ID = f"{MARK}:Env-v0"
 COMMANDS = ("evaluate", "resume", "load", "settings")
@@ -182,16 +182,7 @@ def play(place: Path) -> dict[str, Any]:
         # what is harmless costs a whole run: one command shows it
         names = ("resume",) if attack.words is None and attack.name != "none" else COMMANDS
         for name in names:
-            inner, command = place / "case", commands[name]
-            shutil.rmtree(inner, ignore_errors=True)
-            inner.mkdir()
-            (inner / "victim").write_text("untouched")
-            shutil.copytree(good, inner / "run")
-            attack.plant(inner / "run")
-            result = outcome(watch, lambda command=command, inner=inner: command(inner / "run"))
-            result["victim"] = (inner / "victim").read_text()
-            result["beside"] = sorted(os.listdir(inner))
-            found[attack.name][name] = result
+            found[attack.name][name] = staged(watch, place / "case", good, attack, commands[name])
     shutil.rmtree(place / "case")
     return found
 

@@ -11,13 +11,14 @@ import io
 import json
 import os
 import pickle
+import shutil
 import struct
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
-from attacks.watch import MARK
+from attacks.watch import MARK, Watch, outcome
 
 from tightrope.runs import checkpoint
 
@@ -31,6 +32,23 @@ class Attack(NamedTuple):
     name: str
     plant: Callable[[Path], None]
     words: str | None
+
+
+def staged(
+    watch: Watch, inner: Path, good: Path, attack: Attack, command: Callable[[Path], Any]
+) -> dict[str, Any]:
+    """The outcome of a command on a copy of a good folder in which the attack was planted, and what became of
+    the file and the names beside it.
+    """
+    shutil.rmtree(inner, ignore_errors=True)
+    inner.mkdir()
+    (inner / "victim").write_text("untouched")
+    shutil.copytree(good, inner / "run")
+    attack.plant(inner / "run")
+    result = outcome(watch, lambda: command(inner / "run"))
+    result["victim"] = (inner / "victim").read_text()
+    result["beside"] = sorted(path.name for path in inner.iterdir())
+    return result
 
 
 class Bomb:

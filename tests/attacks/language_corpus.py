@@ -22,10 +22,11 @@ from attacks.corpus import (
     link,
     pickled,
     put,
+    staged,
     torch_zip,
     twice,
 )
-from attacks.watch import MARK, Watch, outcome
+from attacks.watch import MARK, Watch
 from language.tiny import saved, tiny_llama
 
 NAMED = f"{MARK}.Model"
@@ -276,15 +277,7 @@ def play(place: Path) -> dict[str, Any]:
     prepare(place)
     watch, found = Watch(place), dict[str, Any]()
     for group, name, good, attack, command in cases(place):
-        inner = place / "case"
-        shutil.rmtree(inner, ignore_errors=True)
-        inner.mkdir()
-        (inner / "victim").write_text("untouched")
-        shutil.copytree(good, inner / "run")
-        attack.plant(inner / "run")
-        result = outcome(watch, lambda command=command, inner=inner: command(inner / "run"))
-        result["victim"] = (inner / "victim").read_text()
-        result["beside"] = sorted(path.name for path in inner.iterdir())
+        result = staged(watch, place / "case", good, attack, command)
         found.setdefault(f"{group}: {attack.name}", {})[name] = result
     return found
 
