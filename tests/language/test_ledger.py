@@ -9,6 +9,7 @@ from transformers import AutoModelForCausalLM, GPT2Config, LlamaConfig
 
 from tightrope.algorithms.optimise import Adam
 from tightrope.language import lora, shapes
+from tightrope.language.kv_cache import cached_forward
 from tightrope.language.ledger import DoesNotFit, Job, Ledger, amount, available_memory, check, job_of, ledger
 from tightrope.language.models import parts, without_dropout
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SFTSettings
@@ -90,8 +91,9 @@ def test_a_separate_critic_is_a_whole_model_of_which_the_base_is_trained(config)
 @CONFIGS
 def test_the_cache_is_the_real_cache(config) -> None:
     rows, length = ALIGN.batch_size, ALIGN.prompt_tokens + ALIGN.response_tokens
-    out = parts(real(config)).base(torch.zeros(rows, length, dtype=torch.int64), use_cache=True)
-    cache = size_of(x for layer in out.past_key_values.layers for x in (layer.keys, layer.values))
+    ones, places = torch.ones(rows, length, dtype=torch.int64), torch.arange(length).expand(rows, length)
+    step = cached_forward(parts(real(config)).base, torch.zeros_like(ones), ones, places)
+    cache = size_of(x for layer in step.cache.layers for x in (layer.keys, layer.values))
     assert entry(ledger(config, ALIGN), "KV cache") == cache
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.heads import at_head
+from tightrope.language.kv_cache import cached_forward
 from tightrope.language.models import parts
 from tightrope.language.token_stats import Sampling, shape_logits
 
@@ -74,8 +75,8 @@ def sample(
     ended = torch.zeros(rows, dtype=torch.bool, device=device)
     stops = torch.tensor(eos, device=device)
 
-    out = base(prompts, attention_mask=real.long(), position_ids=positions(real), use_cache=True)
-    cache, hidden = out.past_key_values, out.last_hidden_state[:, -1]
+    step = cached_forward(base, prompts, real.long(), positions(real))
+    cache, hidden = step.cache, step.hidden[:, -1]
     alive, seen = torch.arange(rows, device=device), real.repeat_interleave(samples_per_prompt, 0)
     if samples_per_prompt > 1:
         cache.batch_repeat_interleave(samples_per_prompt)
@@ -95,11 +96,8 @@ def sample(
             cache.batch_select_indices(kept)
             alive, seen, chosen, place_of_next = alive[kept], seen[kept], chosen[kept], place_of_next[kept]
         seen = torch.cat([seen, seen.new_ones(len(seen), 1)], 1)
-        out = base(
-            chosen[:, None], attention_mask=seen.long(), position_ids=place_of_next[:, None],
-            past_key_values=cache, use_cache=True,
-        )  # fmt: skip
-        hidden, place_of_next = out.last_hidden_state[:, -1], place_of_next + 1
+        step = cached_forward(base, chosen[:, None], seen.long(), place_of_next[:, None], cache)
+        cache, hidden, place_of_next = step.cache, step.hidden[:, -1], place_of_next + 1
     return Responses(tokens, mask, logp, ended, support)
 
 
