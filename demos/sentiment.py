@@ -149,9 +149,6 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--json", type=Path, help="write figures and curve here")
     options = parser.parse_args(words)
     out = options.out or Path("runs") / f"sentiment-{time.strftime('%Y%m%d-%H%M%S')}"
-    from transformers.utils import logging
-
-    logging.disable_progress_bar()
     rows = reviews()
     first, second = int(GOLD_SHARE * len(rows)), int((GOLD_SHARE + REWARD_SHARE) * len(rows))
     for_gold, for_reward, for_prompts = rows[:first], rows[first:second], rows[second:]

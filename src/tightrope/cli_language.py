@@ -281,9 +281,6 @@ def _require_transformers() -> None:
 
     if importlib.util.find_spec("transformers") is None:
         raise UsageError(NEEDED)
-    from transformers.utils import logging
-
-    logging.disable_progress_bar()  # runs have a display of their own
 
 
 # ---------------------------------------------------------------------------- output

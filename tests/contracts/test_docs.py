@@ -43,6 +43,8 @@ from tightrope.cli import main
 TRAINING = ["--total-steps", "2048", "--evaluate-every", "0.5", "--evaluation-episodes", "2"]
 RESUMING = ["--total-steps", "3072"]
 LANGUAGES = {"python", "sh", "console", "diff", "text", "json"}
+# a progress bar of tqdm, a log line of transformers, a Python warning
+LIBRARIES = re.compile(r"it/s\]|s/it\]|\[transformers\]|^\S+:\d+: \w*Warning: ", re.MULTILINE)
 QUOTED = re.compile(r"# (src/\S+\.py)\n")
 
 
@@ -74,6 +76,7 @@ def run_command(line: str) -> None:
         code, printed = run(replaced(words[1:], more))
         assert code == 0, f"{line}\n{printed}"
         assert printed.strip(), f"{line} printed nothing"
+        assert not LIBRARIES.search(printed), f"{line}: a library printed into it\n{printed}"
     elif words[0] == "make":
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert set(words[1:]) <= set(targets), line

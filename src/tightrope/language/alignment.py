@@ -15,6 +15,7 @@ import torch
 
 from tightrope.language.fitting import Reporter, silent
 from tightrope.language.kl import bias_of
+from tightrope.language.quiet import quiet
 from tightrope.language.saving import restore_state
 from tightrope.language.settings import NOT_HERE, AlignSettings
 from tightrope.language.trainer import Aligned, Trainer
@@ -25,6 +26,7 @@ from tightrope.runs.run import Run, teller
 __all__ = ["Aligned", "align", "resume_align"]
 
 
+@quiet()
 def align(
     settings: AlignSettings | None = None,
     *,
@@ -78,6 +80,7 @@ def _named(prompts: Any, reward: Any, gold: Any) -> dict[str, str]:
     return found
 
 
+@quiet()
 def resume_align(
     run_dir: str | Path,
     *,

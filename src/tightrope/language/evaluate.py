@@ -14,6 +14,7 @@ import torch
 from tightrope.language.alignment import settings_from_json
 from tightrope.language.data import Prompt, pad_left, read_prompts
 from tightrope.language.models import eos_ids, find_model, load_causal, load_tokenizer
+from tightrope.language.quiet import quiet
 from tightrope.language.samples import read_samples
 from tightrope.language.sampling import sample
 from tightrope.language.settings import AlignSettings
@@ -21,6 +22,7 @@ from tightrope.language.token_stats import Sampling
 from tightrope.runs.run import Run
 
 
+@quiet()
 def sample_run(
     path: str | Path, prompt: Sequence[Any] | None = None, *, count: int = 8, seed: int | None = None
 ) -> list[dict[str, Any]]:

@@ -33,6 +33,7 @@ from tightrope.language.fitting import (
     warner,
 )
 from tightrope.language.models import fused, load_tokenizer, parts, without_dropout
+from tightrope.language.quiet import quiet
 from tightrope.language.reading import pretrained, read_object
 from tightrope.language.reward_saving import SHIFT, reward_skeleton, save_reward
 from tightrope.language.sampling import positions
@@ -79,6 +80,7 @@ class RewardModel:
         return self.raw(tokens, real) - self.shift
 
 
+@quiet()
 def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> RewardModel:
     """A reward model from a run folder of ``tightrope reward``, or from any folder that
     AutoModelForSequenceClassification loads with one label and a head called ``score``.
@@ -179,6 +181,7 @@ def normalise(model: RewardModel, texts: Sequence[Sequence[int]], size: int) -> 
     return mean, deviation
 
 
+@quiet()
 def train_reward(
     settings: RewardSettings,
     *,
@@ -205,6 +208,7 @@ def train_reward(
         return _train(settings, loaded, given, report, run_dir)
 
 
+@quiet()
 def resume_reward(
     run_dir: str | Path,
     *,

@@ -14,6 +14,7 @@ from tightrope.algorithms.optimise import make_optimiser
 from tightrope.language.collect import Experience, gather, rewards_of, to_batch
 from tightrope.language.data import Prompt, pad_left, pad_right
 from tightrope.language.policy_model import PolicyModel
+from tightrope.language.quiet import quiet
 from tightrope.language.rewards import Scores
 from tightrope.language.roles import Roles, make_roles
 from tightrope.language.sampling import log_ratio_limit
@@ -25,6 +26,7 @@ WORDS = ("The", "Once upon a time there was", "I think that", "a b c d e f g h")
 GRADIENT_LIMIT = 1e-3  # relative, of the norm: float32 sums in another order
 
 
+@quiet()
 def check_model(model: str, dtype: str = "float32") -> list[Finding]:
     """Every check of one model; a few seconds, nothing is written."""
     settings = AlignSettings(

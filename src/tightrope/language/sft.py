@@ -29,6 +29,7 @@ from tightrope.language.fitting import (
 )
 from tightrope.language.models import attention_window, parts
 from tightrope.language.packing import Packed, attention_of, collate, pack, row_of
+from tightrope.language.quiet import quiet
 from tightrope.language.saving import write_model
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised import announcement, finish, opened, recorded, reopened
@@ -96,6 +97,7 @@ def mean_loss(model: Any, rows: Sequence[Packed], size: int) -> float:
     return total / count
 
 
+@quiet()
 def train_sft(
     settings: SFTSettings,
     *,
@@ -119,6 +121,7 @@ def train_sft(
         return _train(settings, loaded, data, validation, report, run_dir)
 
 
+@quiet()
 def resume_sft(
     run_dir: str | Path,
     *,

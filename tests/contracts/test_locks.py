@@ -1,0 +1,104 @@
+"""The README's commands install the versions of locks/, next year too; pyproject.toml names open ranges."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib import metadata
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+from source_tree import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MAKEFILE = (ROOT / "Makefile").read_text()
+EVERYDAY = ("demo", "demo-language", "test")
+LINE = re.compile(r"[a-z0-9][a-z0-9-]*==[0-9][0-9a-z.]*( ; [^#]+)?")
+# an accelerator's packages: torch's own metadata names each at one version
+ACCELERATOR = ("nvidia-", "cuda-", "triton")
+
+
+def pins(name: str) -> list[str]:
+    """The lines of a lock, comments left out."""
+    text = (ROOT / "locks" / f"{name}.txt").read_text()
+    return [line for line in text.splitlines() if not line.startswith("#")]
+
+
+def locked_here(name: str) -> dict[str, Version]:
+    """Package -> version of a lock, of the lines whose markers hold for this interpreter and platform."""
+    found = {}
+    for line in pins(name):
+        pin = Requirement(line)
+        if pin.marker is None or pin.marker.evaluate():
+            found[canonicalize_name(pin.name)] = Version(next(iter(pin.specifier)).version)
+    return found
+
+
+def ranges() -> list[Requirement]:
+    """Every requirement of pyproject.toml, but for the package's own extras."""
+    extras = [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
+    found = [Requirement(line) for line in (*PROJECT["dependencies"], *extras)]
+    return [requirement for requirement in found if requirement.name != PROJECT["name"]]
+
+
+@pytest.mark.parametrize("name", [*EVERYDAY, "oldest"])
+def test_a_lock_is_one_version_a_line_without_hash_address_or_local_version(name):
+    wrong = [line for line in pins(name) if not LINE.fullmatch(line) or line.startswith(ACCELERATOR)]
+    assert not wrong, f"locks/{name}.txt: {wrong}. Write it again with: make lock"
+
+
+def test_the_locks_agree():
+    """`make test` after `make demo` in one environment changes no version."""
+    whole = locked_here("test") | locked_here("demo-language")
+    for name in EVERYDAY:
+        here = locked_here(name)
+        assert {k: whole[k] for k in here} == here
+
+
+@pytest.mark.locked
+def test_what_is_installed_is_what_the_locks_name():
+    """Complete: nothing came in that no lock names, and nothing at another version."""
+    known = locked_here("test") | locked_here("demo-language")
+    own = {"tightrope", "pip"}
+    installed = {canonicalize_name(d.name): Version(d.version) for d in metadata.distributions()}
+    wrong = {
+        name: f"{version} installed, {known.get(name, 'nothing')} locked"
+        for name, version in installed.items()
+        if name not in own and str(known.get(name)) != version.public
+    }
+    assert not wrong, f"{wrong}. Write the locks again with `make lock`, then `make clean test`."
+
+
+def test_every_install_of_the_readme_commands_takes_its_lock():
+    recipes = re.findall(
+        r"^\$\(VENV\)/\.(?:demo|demo-language|test):.*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE
+    )
+    lines = [line for recipe in recipes for line in recipe.splitlines() if "$(PIP)" in line]
+    assert len(lines) == 6
+    assert not [line for line in lines if not re.search(r"--constraint locks/[\w-]+\.txt ", line)]
+    # an isolated build would fetch whatever setuptools is newest that day
+    assert not [line for line in lines if "--editable" in line and "--no-build-isolation" not in line]
+
+
+def test_ranges_are_open_and_the_oldest_lock_holds_their_lower_ends():
+    oldest = locked_here("oldest")
+    for requirement in ranges():
+        ends = [(x.operator, x.version) for x in requirement.specifier]
+        assert len(ends) == 1, f"{requirement} is not an open range"
+        assert ends[0][0] == ">=", f"{requirement} is not an open range"
+        if requirement.name == "envpool":  # 800 MB that no target installs
+            continue
+        lower, held = Version(ends[0][1]), oldest[canonicalize_name(requirement.name)]
+        known = len(lower.release)
+        assert held.release[:known] == lower.release, f"{requirement}: test-oldest runs with {held}"
+
+
+def test_both_ends_of_the_ranges_are_tested_without_the_lock_of_every_day():
+    recipe = re.search(r"^test-newest test-oldest: .*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE)
+    assert recipe is not None
+    assert "$(CONSTRAINT_$*)" in recipe[1]
+    assert re.findall(r"^CONSTRAINT_(\w+) := (.*)$", MAKEFILE, re.MULTILINE) == [
+        ("oldest", "--constraint locks/oldest.txt")
+    ]

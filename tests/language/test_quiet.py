@@ -1,0 +1,73 @@
+"""No warning and no progress bar of a library reaches the terminal, and nothing stays switched off after."""
+
+import subprocess
+import sys
+import warnings
+
+import pytest
+from language.tiny import saved, tiny_llama
+
+from tightrope.language.quiet import quiet
+
+PROGRAM = """
+from tightrope.language import align, sample_run
+
+def reward(prompts, completions, **columns):
+    return [float(len(c)) for c in completions]
+
+small = dict(total_episodes=8, batch_size=8, minibatch_size=8, max_new_tokens=4, max_prompt_tokens=8)
+run = align(model={model!r}, prompts=["ab", "ba"], reward=reward, seed=1, run_dir="run", **small)
+assert len(sample_run(run.path)) == 2
+"""
+
+
+def test_align_in_python_prints_nothing_of_its_libraries(tmp_path):
+    """A program of a user's own, under Python's own filters: nobody has asked for silence."""
+    program = PROGRAM.format(model=saved(tmp_path / "model", tiny_llama()))
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
+
+
+def from_library(module: str, category: type[Warning] = FutureWarning) -> None:
+    warnings.warn_explicit("`old` is deprecated", category, "file.py", 1, module=module, registry={})
+
+
+@pytest.mark.parametrize("module", ["transformers.models.llama", "torch", "tightrope.language.sampling"])
+def test_deprecations_of_libraries_are_hidden_unless_somebody_asked(module):
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.resetwarnings()
+        with quiet():
+            from_library(module)
+        assert seen == []
+        warnings.simplefilter("error")
+        with quiet(), pytest.raises(FutureWarning):
+            from_library(module)
+
+
+@pytest.mark.parametrize(
+    "module, category", [("my_reward", FutureWarning), ("torchvision", FutureWarning), ("torch", UserWarning)]
+)
+def test_warnings_of_a_users_own_code_and_of_other_kinds_are_shown(module, category):
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.resetwarnings()
+        with quiet():
+            from_library(module, category)
+    assert [str(x.message) for x in seen] == ["`old` is deprecated"]
+
+
+@pytest.mark.parametrize("bars", [True, False])
+def test_what_was_set_before_is_put_back_after_an_error_too(bars):
+    from transformers.utils import logging
+
+    before = logging.get_verbosity(), logging.is_progress_bar_enabled(), list(warnings.filters)
+    (logging.enable_progress_bar if bars else logging.disable_progress_bar)()
+    try:
+        with pytest.raises(KeyError), quiet():
+            assert not logging.is_progress_bar_enabled()
+            assert logging.get_verbosity() == logging.ERROR
+            raise KeyError
+        assert logging.is_progress_bar_enabled() == bars
+        assert (logging.get_verbosity(), list(warnings.filters)) == before[::2]
+    finally:
+        (logging.enable_progress_bar if before[1] else logging.disable_progress_bar)()
