@@ -14,8 +14,9 @@ import torch
 from tightrope.runs import versions
 
 LIBRARIES = (*versions.LIBRARIES, "tokenizers", "llvmlite")
-# Some 15 times what AVX2, plain SSE2, other kernels of MKL and OpenBLAS and another target of numba change at
-# most in these runs, which are short so that rounding cannot grow: 2e-5 of a number, 1e-6 of one near 0.
+# Some 15 times what was seen with AVX2 and plain SSE2, other kernels of MKL and OpenBLAS, another target of
+# numba, transformers 5.0, numpy 2.3 and gymnasium 1.2: at most 2e-5 of a number + 2e-6. In runs as
+# short as these rounding cannot grow.
 RELATIVE, ABSOLUTE = 3e-4, 3e-5
 SHOWN = 8
 
@@ -29,7 +30,10 @@ def machine() -> dict[str, str]:
     found = {name: value for name, value in versions.known().items() if name != "tightrope"}
     for name in LIBRARIES:
         found[name] = str(importlib.import_module(name).__version__)
-    features = sorted(name for name, there in binding.get_host_cpu_features().items() if there)
+    try:
+        features = sorted(name for name, there in binding.get_host_cpu_features().items() if there)
+    except RuntimeError:  # older versions do not know them on every processor
+        features = ["unknown features"]
     found["processor type"] = f"{binding.get_host_cpu_name()} with {' '.join(features)}"
     return found
 
