@@ -19,6 +19,7 @@ FOREIGN = [
     r"\b(?:chat" + "gpt|cla" + r"ude|copi" + r"lot)\b",
     r"\bas an " + r"ai\b|\blanguage model " + "wrote",
 ]
+OLD_RUNS = ROOT / "tests" / "old_runs"  # run folders as they were written, which tests read and go on with
 TEXT = {".py", ".md", ".toml", ".txt", ".cfg", ".ini", ".yml", ".yaml", ".json", ".svg", ".sh", ""}
 
 
@@ -42,10 +43,16 @@ def test_the_check_can_fail():
 
 
 def test_only_text_and_pictures_are_kept():
-    """No archives, weights or notebooks: what a diff cannot show does not belong into the repository."""
+    """No archives, weights or notebooks: what a diff cannot show does not belong into the repository.
+
+    Old runs are the exception: small ones, that nobody edits.
+    """
     pictures = {".png", ".gif", ".svg", ".jpg", ".webp"}
     known = TEXT | pictures | {".typed"}
+    of_runs = {".jsonl", ".lock", ".safetensors"}
     kept = [path for path in files() if path.suffix not in known and path.parent != ROOT]
-    assert not [name_of(path) for path in kept]
+    assert not [name_of(p) for p in kept if not (OLD_RUNS in p.parents and p.suffix in of_runs)]
     heavy = [name_of(path) for path in files() if path.stat().st_size > 2_000_000]
     assert not heavy
+    days = [folder for folder in OLD_RUNS.iterdir() if folder.is_dir()]
+    assert all(sum(path.stat().st_size for path in files(under=day)) < 2_000_000 for day in days)
