@@ -57,7 +57,7 @@ ALIGN = (
     f"--num-epochs 2 --max-new-tokens 6 --checkpoint-every 0.2 --evaluate-every 0.5 --gold {TASKS}:vowels"
 )
 OWN = f"--env-module {TASKS}"
-# kind -> the words after `tightrope`, where the last of a flag counts; or after ruler_tasks.py, for what is done in Python
+# kind -> the words after `tightrope`, where the last of a flag counts; or what ruler_tasks.py does in Python
 KINDS: dict[str, str] = {
     "cartpole-compiled": f"train CartPole-v1 {TRAIN} --engine fused",
     "cartpole-torch": f"train CartPole-v1 {TRAIN} --engine torch --total-steps 2048",

@@ -16,7 +16,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-WORDS = "the film was good and its story bad but i like an actor who never sings so much".split()
+TEXT = "the film was good and its story bad but i like an actor who never sings so much"
 
 
 class Shelf(gymnasium.Env):
@@ -97,7 +97,8 @@ def vowels(prompts: list[str], completions: list[str], **columns: Any) -> list[f
 
 def write_data(folder: Path) -> None:
     """texts.jsonl, pairs.jsonl, prompts.jsonl and plain.txt: words in orders that arithmetic decides."""
-    lines = [[WORDS[(i * k + k) % len(WORDS)] for i in range(3, 9)] for k in range(1, 33)]
+    words = TEXT.split()
+    lines = [[words[(i * k + k) % len(words)] for i in range(3, 9)] for k in range(1, 33)]
     halves = [(" ".join(line[:3]) + " ", " ".join(line[3:])) for line in lines]
     texts = [{"prompt": a, "completion": b} for a, b in halves]
     pairs = [{"prompt": a, "chosen": f"{b} good", "rejected": f"bad {b}"} for a, b in halves]
@@ -125,8 +126,7 @@ def agents(folder: Path) -> None:
     rows, answers = [], []
     for kind, values in kinds.items():
         agent = getattr(tightrope, kind)("CartPole-v1", **common, **values)
-        for report in agent.iterate(192):
-            rows.append({"agent": kind, "step": report.step, **report.metrics})
+        rows += [{"agent": kind, "step": report.step, **report.metrics} for report in agent.iterate(192)]
         agent.save(folder / kind)
         agent.close()
         again = tightrope.load(folder / kind)
