@@ -203,14 +203,15 @@ def text(found: dict[str, Any]) -> str:
 
 
 def commit() -> str:
-    """The commit that is measured; a + behind it: with changes of the package that are not committed."""
+    """The newest commit that changed the package; a + behind it: with changes that are not committed."""
     git = ["git", "-C", str(ROOT)]
+    told = {"capture_output": True, "text": True, "check": True}
     try:
-        name = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout
-        changed = subprocess.run([*git, "status", "--porcelain", "src"], capture_output=True, text=True)
+        name = subprocess.run([*git, "log", "-1", "--format=%H", "--", "src"], **told).stdout.strip()
+        changed = subprocess.run([*git, "status", "--porcelain", "src"], **told).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return name.strip() + ("+" if changed.stdout.strip() else "")
+    return name + ("+" if changed else "")
 
 
 def main(words: list[str] | None = None) -> int:

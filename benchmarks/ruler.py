@@ -38,7 +38,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 TASKS = ROOT / "benchmarks" / "ruler_tasks.py"
 CLOCKS = {
-    "seconds", "wall_seconds", "steps_per_second", "date", "run_dir",
+    "seconds", "wall_seconds", "steps_per_second", "date", "run_dir",  # the last one: where, not what
     "time/seconds", "time/fps", "time/env_seconds", "time/act_seconds", "time/update_seconds",
     "time/score_seconds", "time/generate_seconds", "time/tokens_per_second",
     "time/checkpoint_seconds", "time/checkpoint_megabytes",
@@ -330,8 +330,11 @@ def main(words: list[str] | None = None) -> int:
         if given.what == "compare":
             return compare(given.file, given.kinds, given.quick, Path(folder))
         kinds = measured(given.kinds or [*KINDS], Path(folder), given.quick)
+    from code_lines import commit
+
     command = " ".join(["python", "benchmarks/ruler.py", *(sys.argv[1:] if words is None else words)])
-    record = {"command": command, "seconds": round(time.monotonic() - begin, 1), "machine": machine()}
+    record = {"command": command, "commit": commit(), "seconds": round(time.monotonic() - begin, 1)}
+    record["machine"] = machine()
     given.file.write_text(json.dumps(record | {"kinds": kinds}, indent=1) + "\n")
     return int(any(kind.get("resumed") for kind in kinds.values()))
 
