@@ -16,7 +16,8 @@ Each run is a process of its own with one thread. Of each run are hashed
 
 Numbers of clocks are left out, by name (see CLOCKS). Hashes are SHA-256, shortened to 16 digits. The last
 bits depend on the processor and on the versions of the libraries, which stand beside them: record anew
-before a refactoring where ``compare`` says that these differ. ``--quick`` leaves out what is resumed.
+before a refactoring where ``compare`` says that these differ. ``--quick`` leaves out what is resumed;
+``--renamed`` accepts other names of tensors, where a refactoring means to change them.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 import signal
 import subprocess
 import sys
@@ -35,8 +37,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from ruler_kinds import KINDS, TASKS
+
 ROOT = Path(__file__).resolve().parents[1]
-TASKS = ROOT / "benchmarks" / "ruler_tasks.py"
 CLOCKS = {
     "seconds", "wall_seconds", "steps_per_second", "date", "run_dir",  # the last one: where, not what
     "time/seconds", "time/fps", "time/env_seconds", "time/act_seconds", "time/update_seconds",
@@ -45,44 +48,6 @@ CLOCKS = {
 }  # fmt: skip
 LIBRARIES = ("torch", "numpy", "numba", "scipy", "gymnasium", "transformers", "tokenizers", "safetensors")
 TRIES = 5  # to kill a run between its first checkpoint and its end
-
-TRAIN = (
-    "--seed 1 --threads 1 --num-envs 4 --num-steps 64 --num-epochs 2 --total-steps 4096 --evaluate-every 0.3 "
-    "--evaluation-episodes 2 --checkpoint-every 0.2 --vector-backend serial"
-)
-ONCE = TRAIN.replace("--num-epochs 2 ", "")  # A2C and REINFORCE have no epochs
-TUNE = "--seed 1 --threads 1 --num-epochs 2 --minibatch-size 4 --max-tokens 24 --checkpoint-every 0.2"
-ALIGN = (
-    "--seed 1 --threads 1 --data prompts.jsonl --total-episodes 48 --batch-size 8 --minibatch-size 4 "
-    f"--num-epochs 2 --max-new-tokens 6 --checkpoint-every 0.2 --evaluate-every 0.5 --gold {TASKS}:vowels"
-)
-OWN = f"--env-module {TASKS}"
-# kind -> the words after `tightrope`, where the last of a flag counts; or what ruler_tasks.py does in Python
-KINDS: dict[str, str] = {
-    "cartpole-compiled": f"train CartPole-v1 {TRAIN} --engine fused",
-    "cartpole-torch": f"train CartPole-v1 {TRAIN} --engine torch --total-steps 2048",
-    "cartpole-extras": f"train CartPole-v1 {TRAIN} --engine torch --total-steps 2048 --shared "
-    "--vector-backend vector --value-clip 0.2 --dual-clip 3 --recompute-advantages --target-kl 0.05 "
-    "--entropy-weight 0.01 --entropy-weight-schedule cosine --micro-batch-size 48",
-    "cartpole-kl-penalty": f"train CartPole-v1 {TRAIN} --total-steps 2048 --kl-beta 0.5 --kl-adapt 0.01",
-    "pendulum-normalised": f"train Pendulum-v1 {TRAIN} --normalise-observations --normalise-rewards",
-    "pendulum-gsde": f"train Pendulum-v1 {TRAIN} --std gsde --total-steps 2048",
-    "pendulum-state-squash": f"train Pendulum-v1 {TRAIN} --std state --squash --total-steps 2048",
-    "masks-workers": f"train RulerShelf-v0 {OWN} {TRAIN} --vector-backend workers --num-workers 2",
-    "image": f"train RulerPicture-v0 {OWN} {TRAIN} --num-steps 16 --total-steps 512 --num-epochs 1",
-    "a2c": f"train CartPole-v1 {ONCE} --algorithm a2c",
-    "reinforce": f"train CartPole-v1 {ONCE} --algorithm reinforce",
-    "agents-in-python": "agents",
-    "sft": f"sft --data texts.jsonl {TUNE}",
-    "sft-full-packed": f"sft --data texts.jsonl {TUNE} --tune full --pack",
-    "reward": f"reward --data pairs.jsonl {TUNE} --lora-layers 2",
-    "align-head": f"align {ALIGN} --reward {TASKS}:vowels --critic head --whiten-rewards --kl-goal 1",
-    "align-adapter": f"align {ALIGN} --reward reward --critic adapter --kl exact-split --critic-from-reward "
-    "--lora-layers 2",
-    "align-separate": f"align {ALIGN} --reward reward --critic separate --tune full --learning-rate 1e-5 "
-    "--critic-warmup 1 --ptx-weight 0.1 --ptx-data plain.txt --truncation bootstrap",
-    "align-in-python": "judged",
-}
 
 
 # ------------------------------------------------------------------------------------- what a run leaves
@@ -142,7 +107,7 @@ def left(run: Path) -> dict[str, Any]:
     """The hashes of everything that a finished run leaves."""
     tensors = tensors_of(run)
     if not tensors:
-        raise SystemExit(f"{run.name} left no tensors.")
+        raise RuntimeError(f"{run.name} left no tensors.")
     rows = {}
     for path in sorted(run.glob("*.jsonl")):
         rows[path.name] = table([json.loads(line) for line in path.read_text().splitlines()])
@@ -176,18 +141,18 @@ def start(words: list[str], base: Path) -> subprocess.Popen[str]:
 
 
 def ended(words: list[str], base: Path) -> None:
-    """Run to the end; SystemExit with what was printed when it fails."""
+    """Run to the end; RuntimeError with what was printed when it fails."""
     process = start(words, base)
     said, _ = process.communicate()
     if process.returncode:
-        raise SystemExit(f"{' '.join(words)} ended with {process.returncode}:\n{said[-4000:]}")
+        raise RuntimeError(f"{' '.join(words)} ended with {process.returncode}:\n{said[-4000:]}")
 
 
 def commands(kind: str, run: str) -> tuple[list[str], list[str] | None]:
     """The words that run a kind, and those that resume it, into the folder ``run``."""
     words = once(KINDS[kind].split())
     if words[0] in ("agents", "judged"):
-        return [str(TASKS), words[0], run], None
+        return [TASKS, words[0], run], None
     kept = [w for flag in ("--env-module", "--gold") if flag in words for w in (flag, flag_of(words, flag))]
     if words[0] == "align":
         kept += ["--reward", flag_of(words, "--reward")]
@@ -222,7 +187,7 @@ def killed(words: list[str], base: Path, run: str) -> int:
         os.killpg(process.pid, signal.SIGKILL)
     said, _ = process.communicate()
     if process.returncode != -signal.SIGKILL and process.returncode:
-        raise SystemExit(f"{' '.join(words)} ended with {process.returncode}:\n{said[-4000:]}")
+        raise RuntimeError(f"{' '.join(words)} ended with {process.returncode}:\n{said[-4000:]}")
     last = newest(base / run)
     return -1 if (base / run / "summary.json").exists() or last is None else int(last.name[5:])
 
@@ -237,14 +202,16 @@ def resumed(kind: str, base: Path, whole: dict[str, Any]) -> list[str]:
         if killed(words, base, run) > 0:
             ended(again, base)
             return differences(whole, left(base / run))
-    raise SystemExit(f"{kind} ended {TRIES} times before it could be killed; make it longer.")
+    raise RuntimeError(f"{kind} ended {TRIES} times before it could be killed; make it longer.")
 
 
 def measured(kinds: list[str], base: Path, quick: bool) -> dict[str, Any]:
-    """Kind -> what it left, run after run; those of the adapter need the reward model before them."""
-    sys.path.insert(0, str(TASKS.parent))
+    """Kind -> what it left, run after run; a kind that fails leaves ``failed``, what it said. Those that need
+    the reward model have it before them.
+    """
     from ruler_tasks import write_data
 
+    shutil.copy(ROOT / "benchmarks" / TASKS, base)
     write_data(base)
     found = {}
     for kind in KINDS:
@@ -252,27 +219,46 @@ def measured(kinds: list[str], base: Path, quick: bool) -> dict[str, Any]:
         if kind not in kinds and not needed:
             continue
         begin = time.monotonic()
-        words, again = commands(kind, kind)
-        ended(words, base)
-        found[kind] = left(base / kind)
-        if again is not None and not quick:
-            found[kind]["resumed"] = resumed(kind, base, found[kind])
-        tensors = found[kind]["tensors"]
-        told = f"{kind:24} {tensors['count']:4} tensors {tensors['values']} {time.monotonic() - begin:5.1f} s"
-        print(told, *found[kind].get("resumed", []), sep="\n  resumed: ", flush=True)
+        try:
+            found[kind] = one(kind, base, quick)
+        except RuntimeError as error:
+            found[kind] = {"failed": str(error)}
+        print(f"{kind:24} {told(found[kind])} {time.monotonic() - begin:5.1f} s", flush=True)
     return found
+
+
+def one(kind: str, base: Path, quick: bool) -> dict[str, Any]:
+    """Run a kind, and again with a break where that can be. RuntimeError when it fails."""
+    words, again = commands(kind, kind)
+    ended(words, base)
+    found = left(base / kind)
+    if again is not None and not quick:
+        found["resumed"] = resumed(kind, base, found)
+    return found
+
+
+def told(found: dict[str, Any]) -> str:
+    """What a run left, in a line."""
+    if "failed" in found:
+        return "failed"
+    tensors, broken = found["tensors"], "; resumed it differs" if found.get("resumed") else ""
+    return f"{tensors['count']:4} tensors {tensors['values']}{broken}"
 
 
 # ------------------------------------------------------------------------------------- comparing
 
 
-def differences(wanted: dict[str, Any], found: dict[str, Any]) -> list[str]:
-    """What differs between two answers of `left`, a line each; empty when nothing does."""
+def differences(wanted: dict[str, Any], found: dict[str, Any], *, renamed: bool = False) -> list[str]:
+    """What differs between two answers of `one`, a line each; empty when nothing does. ``renamed``: the same
+    tensors in other files or under other names are no difference.
+    """
+    if "failed" in found or "failed" in wanted:
+        return [f"failed: {found.get('failed', 'only when it was recorded')}"]
     said = []
     old, new = wanted["tensors"], found["tensors"]
     if old["values"] != new["values"]:
         said.append(f"tensors differ: {named(old['each'], new['each'])}")
-    elif old["names"] != new["names"]:
+    elif old["names"] != new["names"] and not renamed:
         said.append(f"tensors have other names, and the same values: {named(old['each'], new['each'])}")
     for file in sorted({*wanted["rows"], *found["rows"]}):
         old, new = wanted["rows"].get(file), found["rows"].get(file)
@@ -303,16 +289,17 @@ def machine() -> dict[str, Any]:
     return found | {name: metadata.version(name) for name in LIBRARIES}
 
 
-def compare(path: Path, kinds: list[str] | None, quick: bool, base: Path) -> int:
+def compare(given: argparse.Namespace, base: Path) -> int:
     """Run the kinds of a record again; 1 when anything differs."""
-    record = json.loads(path.read_text())
+    record = json.loads(given.file.read_text())
     there, here = record["machine"], machine()
     changed = [f"{name} {there.get(name)} -> {here[name]}" for name in here if there.get(name) != here[name]]
     if changed:
         print(f"warning: recorded elsewhere ({', '.join(changed)}); last bits may differ.", flush=True)
-    wanted = {kind: record["kinds"][kind] for kind in kinds or record["kinds"]}
-    found = measured(list(wanted), base, quick)
-    lines = [f"{kind}: {line}" for kind in wanted for line in differences(wanted[kind], found[kind])]
+    wanted = {kind: record["kinds"][kind] for kind in given.kinds or record["kinds"]}
+    found = measured(list(wanted), base, given.quick)
+    pairs = {kind: differences(wanted[kind], found[kind], renamed=given.renamed) for kind in wanted}
+    lines = [f"{kind}: {line}" for kind, said in pairs.items() for line in said]
     print(*lines, f"{len(wanted)} kinds, {len(lines)} differences", sep="\n")
     return 1 if lines else 0
 
@@ -324,19 +311,28 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("file", type=Path)
     parser.add_argument("--kinds", nargs="+", choices=[*KINDS], help="these alone")
     parser.add_argument("--quick", action="store_true", help="without what is killed and resumed")
+    parser.add_argument("--renamed", action="store_true", help="compare: names of tensors may be others")
     given = parser.parse_args(words)
     begin = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="ruler-") as folder:
         if given.what == "compare":
-            return compare(given.file, given.kinds, given.quick, Path(folder))
+            return compare(given, Path(folder))
         kinds = measured(given.kinds or [*KINDS], Path(folder), given.quick)
     from code_lines import commit
 
     command = " ".join(["python", "benchmarks/ruler.py", *(sys.argv[1:] if words is None else words)])
     record = {"command": command, "commit": commit(), "seconds": round(time.monotonic() - begin, 1)}
     record["machine"] = machine()
+    if bad := [f"{kind}: {x.get('failed', x.get('resumed'))}" for kind, x in kinds.items() if unfit(x)]:
+        print("nothing is recorded:", *bad, sep="\n")
+        return 1
     given.file.write_text(json.dumps(record | {"kinds": kinds}, indent=1) + "\n")
-    return int(any(kind.get("resumed") for kind in kinds.values()))
+    return 0
+
+
+def unfit(found: dict[str, Any]) -> bool:
+    """Whether a run failed, or ended otherwise after a break."""
+    return "failed" in found or bool(found.get("resumed"))
 
 
 if __name__ == "__main__":
