@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from tightrope.algorithms.settings import A2CSettings
 from tightrope.maths import statistics, surrogate, values
 
 Model = Callable[[Batch], Evaluation]
-ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Tensor]]]
+ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Any]]]
 
 
 def update(
@@ -39,8 +40,9 @@ def update(
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout by one step; returns the metrics.
 
-    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics [B, T])``:
-    the loss is a sum over the part / ``count``, the counting steps of the whole batch, as the rest is.
+    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics)``:
+    the loss is a sum over the part / ``count``, the counting steps of the whole batch, as the rest is; the
+    metrics are [B, T], or a sum and the number of its terms.
     ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the log-ratios exceed
     ``log_ratio_limit``.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from tightrope.algorithms.settings import PPOSettings
 from tightrope.maths import statistics, surrogate, values
 
 Model = Callable[[Batch], Evaluation]
-ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Tensor]]]
+ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Any]]]
 
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, settings: PPOSettings) -> Tensor:
@@ -65,8 +66,9 @@ def update(
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout; returns the metrics, means over every minibatch.
 
-    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics [B, T])``:
-    the loss is a sum over the part / ``count``, the counting steps of the whole minibatch, as the rest is.
+    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics)``:
+    the loss is a sum over the part / ``count``, the counting steps of the whole minibatch, as the rest is;
+    the metrics are [B, T], or a sum and the number of its terms.
     ``refresh(batch) -> batch`` estimates advantages anew when ``recompute_advantages`` is on.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the first log-ratios exceed
     ``log_ratio_limit``.

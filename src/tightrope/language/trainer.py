@@ -224,7 +224,8 @@ class Trainer:
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
         batch = to_batch(experience, rewards, valid, settings)
         share = kl_share(experience, settings, self.kl_beta)
-        metrics = describe(experience, scores, rewards, share, valid) | scores.metrics | gold
+        plain = rewards / self.reward_scale  # the metrics are those before whiten_rewards
+        metrics = describe(experience, scores, plain, share, valid) | scores.metrics | gold
         refuse_mismatch(metrics["objective/sampling_gap"], settings.dtype, first=not self.iteration)
         self._watch(metrics)
         judged = time.perf_counter()
@@ -289,10 +290,8 @@ class Trainer:
         """The KL's share in the loss and the pretraining loss; None when neither is asked for."""
         form, pretraining = self.settings.kl, self.pretraining
 
-        def extra(
-            model: Any, part: Batch, now: Evaluation, count: Tensor
-        ) -> tuple[Tensor, dict[str, Tensor]]:
-            total, booked = now.logp.new_zeros(()), {}
+        def extra(model: Any, part: Batch, now: Evaluation, count: Tensor) -> tuple[Tensor, dict[str, Any]]:
+            total, booked = now.logp.new_zeros(()), dict[str, Any]()
             log_ratio = now.logp.detach() - part.old_logp
             kl = kl_loss(form, now.logp, part.inputs["ref_logp"], model.kl, part.mask, count, log_ratio)
             if kl is not None:
@@ -302,7 +301,7 @@ class Trainer:
                 # a sum over the texts of one response beside a sum over the response, as in InstructGPT
                 loss, tokens = pretraining.loss(len(part))
                 total = total + self.settings.ptx_weight * loss / (pretraining.per_response * count)
-                booked["ptx_loss"] = loss.detach() / tokens * part.mask
+                booked["ptx_loss"] = loss, tokens
             return total, booked
 
         return extra if not form.endswith("reward") or pretraining is not None else None
