@@ -61,6 +61,7 @@ def update(
     rng: np.random.Generator,
     *,
     extra_loss: ExtraLoss | None = None,
+    draw: Callable[[Batch], Batch] | None = None,
     refresh: Callable[[Batch], Batch] | None = None,
     log_ratio_limit: float | None = None,
 ) -> dict[str, float]:
@@ -69,6 +70,7 @@ def update(
     ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics)``:
     the loss is a sum over the part / ``count``, the counting steps of the whole minibatch, as the rest is;
     the metrics are [B, T], or a sum and the number of its terms.
+    ``draw(minibatch) -> minibatch`` adds inputs that are drawn at random, once: a pass may be repeated.
     ``refresh(batch) -> batch`` estimates advantages anew when ``recompute_advantages`` is on.
     Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the first log-ratios exceed
     ``log_ratio_limit``.
@@ -81,6 +83,7 @@ def update(
             batch = refresh(batch).cleared()
         for minibatch in batch.minibatches(settings.minibatch_size, rng):
             number += 1
+            minibatch = minibatch if draw is None else draw(minibatch)
             if settings.normalise_advantages:
                 advantages = statistics.standardise(minibatch.advantages, minibatch.mask)
                 minibatch = dataclasses.replace(minibatch, advantages=advantages)

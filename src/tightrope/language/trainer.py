@@ -271,9 +271,9 @@ class Trainer:
             kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
         extra = None if warming else self._extra_loss(kl_weight)
         present = present.unchecked(micro_batch_size=self.micro_batch_size)
-        metrics = ppo.update(
-            model, self.optimiser, batch, present, self.update_rng, extra_loss=extra, log_ratio_limit=limit
-        )
+        given = (model, self.optimiser, batch, present, self.update_rng)
+        draw = None if extra is None or self.pretraining is None else self.pretraining.draw
+        metrics = ppo.update(*given, extra_loss=extra, draw=draw, log_ratio_limit=limit)
         if "train/micro_batch_size" in metrics:
             self._smaller(int(metrics["train/micro_batch_size"]))
         return metrics
@@ -299,7 +299,7 @@ class Trainer:
                 booked["kl_loss"] = kl.detach() * count / part.mask.sum().clamp(min=1) * part.mask
             if pretraining is not None:
                 # a sum over the texts of one response beside a sum over the response, as in InstructGPT
-                loss, tokens = pretraining.loss(len(part))
+                loss, tokens = pretraining.loss(part.inputs["ptx"])
                 total = total + self.settings.ptx_weight * loss / (pretraining.per_response * count)
                 booked["ptx_loss"] = loss, tokens
             return total, booked
