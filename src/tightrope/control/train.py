@@ -26,8 +26,9 @@ from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.grid import crosses
 from tightrope.runs.history import steps_in
+from tightrope.runs.report import teller
 from tightrope.runs.rollback import rolling_back
-from tightrope.runs.run import Run, teller
+from tightrope.runs.run import Run
 
 __all__ = ["resolve", "resume", "train"]
 
@@ -77,7 +78,7 @@ def resume(
 
     ``total_steps`` extends a finished run: schedules and grid run over the new budget from here on.
     """
-    with Run.open(run_dir, own=True).lock() as run:
+    with Run.open(run_dir, own=True) as run:
         return _resume(run, total_steps, report, env, policy)
 
 

@@ -42,7 +42,8 @@ from tightrope.language.settings import SupervisedSettings
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.grid import crosses
-from tightrope.runs.run import Run, teller
+from tightrope.runs.report import teller
+from tightrope.runs.run import Run
 
 Item = TypeVar("Item")
 Reporter = Callable[[str, dict[str, Any]], None]

@@ -40,6 +40,14 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
     it has another writer.
     """
     run = Run.open(run_dir, own=True)
+    try:
+        return run, _settings_again(kind, run, run_dir, given)
+    except BaseException:
+        run.close()
+        raise
+
+
+def _settings_again(kind: type[Settings], run: Run, run_dir: str | Path, given: dict[str, Any]) -> Settings:
     unknown = sorted(set(run.settings) - {field.name for field in dataclasses.fields(kind)})
     if unknown:
         raise ValueError(f"{run_dir} has settings that {kind.__name__} has not: {', '.join(unknown)}.")
@@ -51,7 +59,7 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
                 f"The {name} of {run_dir} was {run.settings[name]}, an object that no file holds. Give it "
                 f"again: {name}=... in Python{command}."
             )
-    return run.lock(), recorded(kind(**run.settings), **given)
+    return recorded(kind(**run.settings), **given)
 
 
 def opened(run: Run | str | Path | None, settings: SupervisedSettings, command: str) -> Run:
