@@ -15,13 +15,13 @@ from tightrope.language.alignment import align
 from tightrope.language.answers import RewardError
 from tightrope.language.collect import gather
 from tightrope.language.data import Prompt
-from tightrope.language.fitting import silent
 from tightrope.language.kl import KL_FORMS, AdaptiveKL
 from tightrope.language.policy_model import PolicyModel
 from tightrope.language.ptx import Pretraining
 from tightrope.language.reward_model import train_reward
 from tightrope.language.settings import AlignSettings, RewardSettings
 from tightrope.language.trainer import Trainer, hold_out
+from tightrope.runs.report import silent
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
 

@@ -11,14 +11,14 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from tightrope.language.fitting import Reporter, silent, threads
+from tightrope.language.fitting import threads
 from tightrope.language.kl import bias_of
 from tightrope.language.saving import restore_state
 from tightrope.language.settings import NOT_HERE, AlignSettings
 from tightrope.language.trainer import Aligned, Trainer
 from tightrope.runs.history import steps_in
 from tightrope.runs.records import retyped
-from tightrope.runs.report import teller
+from tightrope.runs.report import Reporter, say, silent, teller, warn
 from tightrope.runs.run import Run
 
 __all__ = ["Aligned", "align", "resume_align"]
@@ -44,9 +44,9 @@ def align(
     """
     settings = (settings or AlignSettings()).with_values(**_named(prompts, reward, gold), **values)
     for risk in settings.risks():
-        report("line", {"text": f"warning: {risk}", "warning": True})
+        warn(report, risk)
     if (bias := bias_of(settings.kl)) is not None:
-        report("line", {"text": f"warning: {bias}.", "warning": True})
+        warn(report, f"{bias}.")
     sources = (
         settings.data if prompts is None else prompts,
         settings.reward if reward is None else reward,
@@ -136,7 +136,7 @@ def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
         )
     if point is not None and trainer.episodes >= settings.total_episodes:
         text = f"{run.path} has its {trainer.episodes:,} responses; --total-episodes N goes on from there."
-        report("line", {"text": text})
+        say(report, text)
     trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
     run.rewind(point)
     run.update_settings(dataclasses.asdict(settings))

@@ -13,9 +13,10 @@ from typing import Any, TypeVar
 
 from torch import nn
 
-from tightrope.language.fitting import Loaded, Reporter
+from tightrope.language.fitting import Loaded
 from tightrope.language.models import parameter_counts
 from tightrope.language.settings import SupervisedSettings
+from tightrope.runs.report import Reporter
 from tightrope.runs.run import Run
 
 Settings = TypeVar("Settings", bound=SupervisedSettings)

@@ -31,7 +31,6 @@ from tightrope.language.collect import (
 )
 from tightrope.language.data import Prompt, hold_out, read_prompts, read_rows
 from tightrope.language.faults import refuse_bad_numbers, refuse_mismatch
-from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.models import context_length, find_model
 from tightrope.language.monitor import Monitor
@@ -53,6 +52,7 @@ from tightrope.language.settings import AlignSettings
 from tightrope.maths.values import explained_variance
 from tightrope.runs import signals
 from tightrope.runs.grid import crosses
+from tightrope.runs.report import Reporter, teller, warn
 from tightrope.runs.run import Run
 
 
@@ -84,7 +84,7 @@ class Trainer:
         self.roles: Roles = make_roles(
             settings,
             on_trunk,
-            lambda text: report("line", {"text": text}),
+            teller(report),
             own_reward=on_trunk is None and is_folder(reward),
         )
         self.prompts = self._read_prompts(prompts)
@@ -123,7 +123,7 @@ class Trainer:
         return found
 
     def _warn(self, text: str) -> None:
-        self.report("line", {"text": f"warning: {text}", "warning": True})
+        warn(self.report, text)
 
     # ------------------------------------------------------------------------------------------ the loop
 
