@@ -72,8 +72,8 @@ def update(
     the metrics are [B, T], or a sum and the number of its terms.
     ``draw(minibatch) -> minibatch`` adds inputs that are drawn at random, once: a pass may be repeated.
     ``refresh(batch) -> batch`` estimates advantages anew when ``recompute_advantages`` is on.
-    Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the first log-ratios exceed
-    ``log_ratio_limit``.
+    Rows without a counting step are left out. Raises ValueError when no step counts, NonFiniteError before a
+    step with a bad gradient, SamplingMismatch when the first log-ratios exceed ``log_ratio_limit``.
     """
     meter, brake, batch = Meter(), Brake(batch.mask.device), batch.cleared()
     clip_high = settings.clip if settings.clip_high is None else settings.clip_high

@@ -47,8 +47,8 @@ def update(
     metrics are [B, T], or a sum and the number of its terms.
     ``draw(batch) -> batch`` adds inputs that are drawn at random, once: a pass may be repeated.
     ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
-    Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the log-ratios exceed
-    ``log_ratio_limit``.
+    Rows without a counting step are left out. Raises ValueError when no step counts, NonFiniteError before a
+    step with a bad gradient, SamplingMismatch when the log-ratios exceed ``log_ratio_limit``.
     """
     meter, brake, batch = Meter(), Brake(batch.mask.device), batch.cleared()
     batch = batch if draw is None else draw(batch)
