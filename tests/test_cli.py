@@ -460,8 +460,9 @@ def a_run(folder: Path, stop_at: int | None = None) -> Any:
 
     def train(settings: TrainSettings, run_dir: str | None, report: Any) -> dict[str, Any]:
         with Run.create(folder / "run", settings_to_json(settings), "name") as run:
-            report("line", {"text": "warning: clip is high"})
-            report("start", {"settings": SETTINGS, "run_dir": str(run.path), "lines": ["engine: fused"]})
+            report("line", {"text": "clip is high", "warning": True})
+            where = {"run_dir": str(run.path), "step": 0, "total_steps": 1000}
+            report("start", {"settings": SETTINGS, **where, "lines": ["engine: fused"]})
             for update in range(1, 101):
                 values = {"rollout/ep_rew_mean": float(update), "train/approx_kl": 0.01, "time/fps": 5000.0}
                 values |= {"rollout/ep_len_mean": 20.0, "train/clip_fraction": 0.1}
@@ -679,7 +680,7 @@ def test_time_left_counts_this_runs_steps_only(monkeypatch: pytest.MonkeyPatch) 
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     progress = panel.Progress()
-    progress.take("start", {"settings": SETTINGS, "run_dir": "run", "step": 400})
+    progress.take("start", {"settings": SETTINGS, "run_dir": "run", "step": 400, "total_steps": 1000})
     now[0] += 10.0
     progress.take("update", {"step": 600, "total_steps": 1000, "metrics": {}, "seconds": 1.0})
     assert progress.seconds_left() == pytest.approx(20.0)

@@ -1,10 +1,17 @@
 """How a run shows itself: a live panel on a terminal, plain lines elsewhere, or nothing. All three are
 `report` calls.
 
-``report(event, data)`` is called by the training loops with ``start``       settings, run (folder),
-total_steps, step (where a resumed run stands), lines (text to print) ``line``        text, warning (True:
-also printed when quiet) ``update``      step, total_steps, seconds, metrics ``evaluation``  step,
-mean_reward, std_reward ``finish``      summary
+The training loops call ``report(event, data)``. These are the events and the keys of their data:
+
+- ``line``: ``text``, and ``warning``: True for one, printed also when quiet, and with "warning: " before it.
+- ``start``: ``settings``, ``run_dir``, ``step`` (where the run stands), ``total_steps``, ``lines`` to print.
+- ``update``: ``step``, ``total_steps``, ``seconds`` of training so far, ``metrics`` as in metrics.jsonl.
+- ``evaluation`` (control): ``step``, ``eval/mean_reward``, ``eval/std_reward``, ``eval/mean_length``,
+  ``eval/episodes``.
+- ``samples`` (align): ``step``, ``rows`` as in samples.jsonl.
+- ``finish``: the keys of summary.json.
+
+Steps are environment steps, responses (align), or optimiser steps (sft, reward).
 """
 
 from __future__ import annotations
@@ -16,6 +23,8 @@ import time
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Protocol, TextIO
+
+from tightrope.runs.report import shown
 
 BARS = "▁▂▃▄▅▆▇█"
 PLAIN_LINES = 20
@@ -63,10 +72,10 @@ class Lines:
         self._progress.take(event, data)
         self.run, self.step = self._progress.run, self._progress.step
         if event == "line":
-            if str(data["text"]).startswith("warning:"):
-                print(data["text"], file=sys.stderr, flush=True)
+            if data["warning"]:
+                print(shown(data), file=sys.stderr, flush=True)
             elif self._rows:
-                self._print(str(data["text"]))
+                self._print(shown(data))
         elif self._rows and event == "start":
             self._print("\n".join(str(line) for line in data.get("lines", ())))
         elif self._rows and event == "update":
@@ -131,7 +140,7 @@ class Panel:
         self._progress.take(event, data)
         self.run, self.step = self._progress.run, self._progress.step
         if event == "line":
-            self._live.console.print(str(data["text"]), markup=False, highlight=False)
+            self._live.console.print(shown(data), markup=False, highlight=False)
         elif event == "start":
             for line in data.get("lines", ()):
                 self._live.console.print(str(line), markup=False, highlight=False)
@@ -202,8 +211,8 @@ class Progress:
             settings = data["settings"]
             self.title = f"{settings['env']} · {settings['algorithm']} · seed {settings['seed']}"
             self.run = str(data["run_dir"])
-            self.total_steps = settings["total_steps"]
-            self.step = self._start_step = data.get("step", 0)
+            self.step = self._start_step = data["step"]
+            self.total_steps = data["total_steps"]
             self._start_time = time.monotonic()
         elif event == "update":
             self.step, self.total_steps = data["step"], data["total_steps"]

@@ -107,6 +107,42 @@ def test_nan_that_a_model_says_behind_the_mask_changes_nothing(rule, settings):
     assert torch.equal(weights(a), weights(b)) and metrics_a == metrics_b
 
 
+@pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
+@pytest.mark.parametrize("columns", [1, 3])
+def test_a_batch_of_which_no_step_counts_is_refused(rule, settings, columns):
+    batch = make_batch(TinyModel(), rows=4, columns=columns)
+    masked = dataclasses.replace(batch, mask=torch.zeros_like(batch.mask))
+    cases = (masked, "False throughout"), (batch.select(slice(0, 0)), "empty"), (masked.as_steps(), "empty")
+    for nothing, words in cases:
+        model = TinyModel()
+        with pytest.raises(ValueError, match=rf"No step of the batch counts.*{words}.*expected at least one"):
+            run(rule, settings, batch=nothing, model=model)
+        assert distance(model, TinyModel()) == 0
+
+
+@pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
+def test_a_row_of_which_no_step_counts_changes_nothing(rule, settings):
+    """Also where it would be a minibatch or a part of its own, whose mean is over nothing."""
+    batch = make_batch(TinyModel(), rows=6, columns=3)
+    kept = torch.tensor([0, 2, 3, 5])
+    mask = batch.mask.clone()
+    mask[1] = mask[4] = False
+    size = {"minibatch_size": 1, "num_epochs": 2} if rule is ppo else {"micro_batch_size": 1}
+    settings = dataclasses.replace(settings, normalise_advantages=False, **size)
+    some, metrics = run(rule, settings, batch=dataclasses.replace(batch, mask=mask))
+    alone, expected = run(rule, settings, batch=batch.select(kept))
+    assert torch.equal(weights(some), weights(alone)) and metrics == expected
+
+
+def test_advantages_that_are_estimated_anew_must_count_too():
+    def nothing(batch):
+        return dataclasses.replace(batch, mask=torch.zeros_like(batch.mask))
+
+    settings = PPOSettings(num_epochs=2, recompute_advantages=True, minibatch_size=24)
+    with pytest.raises(ValueError, match="No step of the batch counts"):
+        run(ppo, settings, refresh=nothing)
+
+
 def test_every_row_is_used_once_an_epoch_and_the_last_minibatch_may_be_smaller():
     model, metrics = run(ppo, PPOSettings(num_epochs=3, minibatch_size=10))
     assert model.calls == 9

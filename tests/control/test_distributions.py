@@ -11,6 +11,7 @@ from tightrope.control.distributions import Distribution
 from tightrope.control.policies import Policy
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import action_layout, observation_layout
+from tightrope.maths import divergence
 
 
 def box(low, high):
@@ -106,3 +107,17 @@ def test_frequencies_follow_the_probabilities():
     shares = [float((actions[:, 0] == k).float().mean()) for k in range(3)]
     assert shares == pytest.approx([0.2, 0.5, 0.3], abs=0.01)
     assert float(actions[:, 1].mean()) == pytest.approx(0.7, abs=0.01)
+
+
+def test_entropies_are_those_of_the_maths_to_the_bit():
+    """Of every kind of component, with masked choices, under a deviation for all rows and one for each."""
+    space = spaces.Tuple((spaces.Discrete(5), spaces.MultiBinary(3), spaces.Box(-1, 1, (4,), np.float32)))
+    layout, generator = action_layout(space), torch.Generator().manual_seed(0)
+    parameters = torch.randn(6, 12, generator=generator)
+    mask = torch.ones(6, 8, dtype=torch.bool)
+    mask[:3, 1] = mask[2:, 6] = False
+    logits = torch.where(mask, parameters[:, :8], -torch.inf)
+    for log_std in (torch.randn(4, generator=generator), torch.randn(6, 4, generator=generator)):
+        wanted = divergence.categorical_entropy(logits[:, :5]) + divergence.bernoulli_entropy(logits[:, 5:])
+        wanted = wanted + divergence.gaussian_entropy(log_std.expand(6, 4))
+        assert torch.equal(Distribution(layout, parameters, log_std, mask).entropy(), wanted)

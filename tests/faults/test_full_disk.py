@@ -20,6 +20,7 @@ from tightrope.language.settings import AlignSettings, SFTSettings
 from tightrope.language.sft import resume_sft, train_sft
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import CannotWrite
+from tightrope.runs.report import shown
 from tightrope.runs.run import Run
 
 SMALL = {"total_steps": 256, "num_envs": 2, "num_steps": 32, "evaluate_every": None, "engine": "torch"}
@@ -83,7 +84,7 @@ def test_a_checkpoint_that_fails_in_the_middle_is_said_and_training_goes_on(
 ) -> None:
     run, _ = STORIES[story]
     told: list[str] = []
-    report = lambda event, data: told.append(str(data.get("text", "")))  # noqa: E731
+    report = lambda event, data: told.append(shown(data) if event == "line" else "")  # noqa: E731
     run(tmp_path / "whole", lambda event, data: None, model)
     with monkeypatch.context() as patch:
         refusing(patch, {2, 3})

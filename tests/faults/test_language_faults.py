@@ -13,10 +13,10 @@ from language.tiny import VOCABULARY, saved, tiny_llama
 
 from tightrope.algorithms.memory import OutOfMemory
 from tightrope.algorithms.nonfinite import NonFiniteError
-from tightrope.language.fitting import silent
 from tightrope.language.rewards import RewardError, Rewards
 from tightrope.language.settings import AlignSettings
 from tightrope.language.trainer import Trainer
+from tightrope.runs.report import silent
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ ERRORS = [
 ]
 
 
-def step(rule, fits, error=ERRORS[0], micro_batch_size=None, late=False):
+def step(rule, fits, error=ERRORS[0], micro_batch_size=None, late=False, noise=False, look=None, **more):
     """One update in which passes over more than ``fits`` rows fail; the parameters and the metrics."""
     module, settings = RULES[rule]
     settings = dataclasses.replace(settings, micro_batch_size=micro_batch_size)
@@ -28,12 +28,16 @@ def step(rule, fits, error=ERRORS[0], micro_batch_size=None, late=False):
 
     def asked(part):
         now = model(part)
+        if noise:  # drawn row by row, so that a split draws the same
+            now = dataclasses.replace(now, entropy=now.entropy + torch.rand(now.entropy.shape))
+        if look is not None:
+            look.append(part.inputs["drawn"])
         passes.append(len(part))
         if len(part) > fits and (not late or passes.count(len(part)) > 1):
             raise error
         return now
 
-    metrics = module.update(asked, optimiser, batch, settings, np.random.default_rng(0))
+    metrics = module.update(asked, optimiser, batch, settings, np.random.default_rng(0), **more)
     return model.slope.detach(), metrics, passes
 
 
@@ -57,6 +61,35 @@ def test_what_a_failed_pass_added_before_it_failed_is_taken_back():
     assert passes == [3, 3, 2, 2, 2]
     torch.testing.assert_close(halved, whole, rtol=0, atol=1e-6)
     assert metrics["train/value_loss"] == pytest.approx(plain["train/value_loss"])
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("late", [False, True])
+def test_a_pass_that_is_repeated_draws_the_same_random_numbers(rule, late):
+    """A policy of one's own may draw some; those of torch begin again where the failed pass began."""
+    ends = []
+    for fits in (100, 2):
+        torch.manual_seed(7)
+        ends.append((step(rule, fits, micro_batch_size=3, late=late, noise=True), torch.rand(3)))
+    (whole, plain, _), (halved, metrics, passes) = (end[0] for end in ends)
+    assert passes == ([3, 3, 2, 2, 2] if late else [3, 2, 2, 2])
+    assert step(rule, 100)[1]["train/entropy"] != plain["train/entropy"]
+    assert metrics["train/entropy"] == pytest.approx(plain["train/entropy"], rel=1e-6)
+    torch.testing.assert_close(halved, whole, rtol=0, atol=1e-6)
+    assert torch.equal(ends[0][1], ends[1][1])  # and so do those after the update
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_what_is_drawn_for_a_minibatch_is_drawn_once(rule):
+    """Inputs that `draw` adds are those of the rows they were drawn for, in every part and repetition."""
+    drawn = []
+
+    def draw(batch):
+        drawn.append(torch.arange(len(batch)) + 100)
+        return dataclasses.replace(batch, inputs={**batch.inputs, "drawn": drawn[-1]})
+
+    step(rule, fits=2, draw=draw, look=(seen := []))
+    assert len(drawn) == 1 and torch.equal(torch.cat(seen[-3:]), drawn[0])
 
 
 def test_a_single_row_that_does_not_fit_ends_with_advice():

@@ -63,7 +63,8 @@ class Tabular(nn.Module):
     def exact(self, tokens: Tensor, reference: "Tabular") -> Tensor:
         """KL(self || reference) of every state on the way, [B, T]."""
         states = self.language.states(tokens)
-        return divergence.categorical_kl(self.logits[states], reference.logits[states])
+        logp, other = (logits[states].log_softmax(-1) for logits in (self.logits, reference.logits))
+        return (logp.exp() * (logp - other)).sum(-1)
 
     def forward(self, batch: Batch) -> Evaluation:
         """What ppo.update asks of a model."""

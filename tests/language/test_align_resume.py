@@ -13,11 +13,12 @@ import torch
 from language.tiny import saved, tiny_llama
 
 from tightrope.cli import main
-from tightrope.language import trainer
+from tightrope.language import alignment, trainer
 from tightrope.language.alignment import align, resume_align
 from tightrope.language.evaluate import sample_run
 from tightrope.language.trainer import Trainer
 from tightrope.runs import checkpoint, signals
+from tightrope.runs.lock import RunInUse
 from tightrope.runs.run import Run
 
 PROMPTS = ["ab", "cde", "f", "ghij", "kl", "mno", "p"]
@@ -191,3 +192,20 @@ def test_other_prompts_and_less_than_was_done_are_refused(tmp_path, values, whol
 def test_a_negative_seed_of_sampling_is_refused(whole):
     with pytest.raises(ValueError, match="seed is -1, expected 0 or more"):
         sample_run(whole.path, seed=-1)
+
+
+@pytest.mark.parametrize("name", ["settings_from_json", "_require_what_no_file_gives", "Trainer"])
+def test_a_run_that_somebody_writes_is_refused_before_its_settings_are_looked_at(
+    tmp_path, whole, monkeypatch, name
+):
+    run = shutil.copytree(whole.path, tmp_path / "run")
+
+    def looked(*_: Any, **__: Any) -> Any:
+        raise AssertionError("looked at before the lock was ours")
+
+    monkeypatch.setattr(alignment, name, looked)
+    with Run.open(run).lock(), pytest.raises(RunInUse, match="this process"):
+        resume_align(run, **GIVEN)
+    with pytest.raises(AssertionError, match="looked at"):
+        resume_align(run, **GIVEN)
+    Run.open(run).lock().close()  # what failed has given the lock back

@@ -182,8 +182,9 @@ def test_every_metric_of_a_rollout_by_hand():
     mask = torch.tensor([[True, True, False], [True, True, True], [True, False, False]])
     logp = torch.tensor([[-1.0, -2.0, nan], [-9.0, -9.0, -9.0], [-0.5, nan, nan]])
     ref_logp = torch.tensor([[-1.5, -1.0, nan], [-1.0, -1.0, -1.0], [-0.25, nan, nan]])
+    sampled = logp + torch.tensor([[0.01, -0.03, 9.0], [0.02, 0.0, 0.0], [0.0, 9.0, 9.0]])
     responses = SimpleNamespace(
-        tokens=torch.zeros(3, 3), mask=mask, logp=logp, ended=torch.tensor([True, True, False])
+        tokens=torch.zeros(3, 3), mask=mask, logp=sampled, ended=torch.tensor([True, True, False])
     )
     experience = SimpleNamespace(
         responses=responses, logp=logp, ref_logp=ref_logp, seconds=2.0,
@@ -206,13 +207,14 @@ def test_every_metric_of_a_rollout_by_hand():
         "objective/rlhf_reward": 1.4 / 2,
         "objective/non_score_reward": -0.2 / 2,
         "objective/entropy": 30.5 / 3,
-        "objective/entropy_token_mean": 22.5 / 6,
+        "objective/entropy_exact": 22.5 / 3,
+        "objective/entropy_token_mean": 30.5 / 6,
         "objective/response_length": 2.0,
         "objective/eos_fraction": 2 / 3,
         "objective/truncated_fraction": 1 / 3,
         "objective/masked_samples": 1.0,
         "objective/distinct_2": 2 / 3,
-        "objective/sampling_gap": 0.0,
+        "objective/sampling_gap": 0.03,
         "time/generate_seconds": 2.0,
         "time/tokens_per_second": 3.0,
     }

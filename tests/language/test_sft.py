@@ -347,4 +347,4 @@ def test_long_rows_are_reported(tmp_path, folder):
     train_sft(settings, data=FACTS, run_dir=tmp_path / "run", report=lambda *event: lines.append(event))
     said = [data["text"] for kind, data in lines if data.get("warning")]
     cut = "8 of 8 rows have more than max_tokens 5 tokens and were cut"
-    assert said == [f"warning: {cut}. Raise max_tokens to keep them whole."]
+    assert said == [f"{cut}. Raise max_tokens to keep them whole."]

@@ -5,6 +5,7 @@ import torch
 
 from tightrope.language import token_stats
 from tightrope.language.token_stats import Sampling, shape_logits, token_statistics
+from tightrope.maths.divergence import categorical_entropy
 
 N, D, V = 11, 6, 17
 
@@ -53,6 +54,25 @@ def test_values_and_gradients(monkeypatch, bias, chunk, sampling, top):
         torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=1e-5)
     # the reference shares the head: its own gradient there is not asked for
     torch.testing.assert_close(got[0], hidden.grad, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("sampling", [Sampling(), Sampling(0.7, forbidden=(0, 1))])
+@pytest.mark.parametrize("top", [0, 5])
+def test_the_entropy_is_that_of_the_maths(monkeypatch, sampling, top):
+    """Value and gradient, chunked, in the very logits that the sampler shapes."""
+    monkeypatch.setattr(token_stats, "CHUNK", 3 * V)
+    head, hidden, _, tokens = numbers(True, torch.float32)
+    support = None
+    if top:
+        support = head(hidden)[:, 2:].topk(top, 1).indices + 2
+        tokens = support[:, 0]
+    found = token_statistics(hidden, head, tokens, sampling, support=support).entropy
+    wanted = categorical_entropy(shape_logits(head(hidden), sampling, support))
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6)
+    weights = torch.randn(N)
+    gradients = [torch.autograd.grad((weights * x).sum(), hidden)[0] for x in (found, wanted)]
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
+    assert float(found.detach().min()) > 0.1
 
 
 def test_the_head_gets_its_gradient_when_it_is_trained():

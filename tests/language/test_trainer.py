@@ -15,12 +15,13 @@ from tightrope.language.alignment import align
 from tightrope.language.answers import RewardError
 from tightrope.language.collect import gather
 from tightrope.language.data import Prompt
-from tightrope.language.fitting import silent
 from tightrope.language.kl import KL_FORMS, AdaptiveKL
 from tightrope.language.policy_model import PolicyModel
+from tightrope.language.ptx import Pretraining
 from tightrope.language.reward_model import train_reward
 from tightrope.language.settings import AlignSettings, RewardSettings
 from tightrope.language.trainer import Trainer, hold_out
+from tightrope.runs.report import silent
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
 
@@ -120,10 +121,12 @@ def test_the_pass_that_the_rollout_keeps_changes_no_metric(folder, monkeypatch):
 
 @pytest.mark.parametrize("micro", [1, 3, 5])
 def test_the_pretraining_loss_adds_up_over_micro_batches(folder, tmp_path, micro):
-    """Texts of very different lengths: a part's mean weighs otherwise than the minibatch's."""
+    """Texts of very different lengths: a part's mean weighs otherwise than the minibatch's. So does the
+    metric, a mean over the tokens of the texts.
+    """
     texts = tmp_path / "texts.txt"
     texts.write_text("ab\nbcdefghijklmnopqrst\ncd\nxyzxyzxyz\n")
-    found = []
+    found, booked = [], []
     for size in (None, micro):
         made = trainer(folder, micro_batch_size=size, minibatch_size=16, ptx_weight=27.8, ptx_data=str(texts),
                        ptx_per_response=2, max_grad_norm=None, num_epochs=1)  # fmt: skip
@@ -133,9 +136,53 @@ def test_the_pretraining_loss_adds_up_over_micro_batches(folder, tmp_path, micro
                 torch.cat([p.grad.flatten() for p in made.roles.parameters() if p.grad is not None])
             )
         )
-        next(made.iterate())
+        booked.append(next(made.iterate())[0]["train/ptx_loss"])
         found.append(gradients[0])
     assert float((found[0] - found[1]).norm()) <= 1e-4 * float(found[0].norm())
+    assert booked[1] == pytest.approx(booked[0], rel=1e-5)
+
+
+def test_a_pass_that_memory_ends_is_repeated_with_the_same_pretraining_texts(folder, tmp_path, monkeypatch):
+    texts = tmp_path / "texts.txt"
+    texts.write_text("\n".join("abcdefghijklmnopqrst"[: 3 + k] for k in range(16)))
+    real, found = Pretraining.loss, []
+    for fails in (False, True):
+        made = shaken(trainer(folder, minibatch_size=8, ptx_weight=27.8, ptx_data=str(texts), num_epochs=2,
+                              ptx_per_response=2, max_grad_norm=None))  # fmt: skip
+        learnt, gradients, left = [], [], [1] if fails else []
+
+        def loss(self, chosen, learnt=learnt, left=left):
+            result = real(self, chosen)
+            if learnt and left:  # in the second minibatch, after its texts were looked at
+                left.pop()
+                raise MemoryError
+            learnt.append(chosen)
+            return result
+
+        monkeypatch.setattr(Pretraining, "loss", loss)
+        made.optimiser.register_step_pre_hook(
+            lambda *_, made=made, gradients=gradients: gradients.append(
+                torch.cat([p.grad.flatten() for p in made.roles.parameters() if p.grad is not None])
+            )
+        )
+        metrics, _ = next(made.iterate())
+        assert not left and ("train/memory_halvings" in metrics) == fails
+        found.append((torch.cat(learnt), gradients, made.pretraining.rng.bit_generator.state))
+    (plain, steps, state), (again, steps_again, state_again) = found
+    assert torch.equal(plain, again) and len(plain.unique()) > 10 and state == state_again
+    assert len(steps) == 4
+    for one, other in zip(steps, steps_again, strict=True):
+        assert float((one - other).norm()) <= 1e-3 * float(one.norm())
+
+
+def test_whitening_leaves_the_reward_metrics_in_units_of_the_score(folder):
+    """Without a score all of the reward is the KL's; whitened, one was divided and the other not."""
+    made = shaken(trainer(folder, reward=nothing, whiten_rewards=True, kl_beta=0.5))
+    metrics, _ = next(made.iterate())
+    assert made.reward_scale != 1.0
+    share = metrics["objective/non_score_reward"]
+    assert share == pytest.approx(-0.5 * metrics["objective/kl"], rel=1e-5)
+    assert metrics["objective/rlhf_reward"] == pytest.approx(share, rel=1e-5)
 
 
 def test_held_out_prompts_are_never_trained_on_not_even_twins():

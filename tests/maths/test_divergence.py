@@ -8,11 +8,8 @@ from torch import Tensor
 
 from tightrope.maths.divergence import (
     bernoulli_entropy,
-    bernoulli_kl,
     categorical_entropy,
-    categorical_kl,
     gaussian_entropy,
-    gaussian_kl,
     k1,
     k2,
     k3,
@@ -36,7 +33,6 @@ def test_the_average_of_the_estimators_by_hand() -> None:
     x = torch.tensor([[0.5, 1.5]], dtype=torch.float64).log()
     assert k1(x).mean().item() == pytest.approx(0.5 * math.log(4 / 3))
     assert k3(x).mean().item() == pytest.approx(0.5 * math.log(4 / 3))
-    assert categorical_kl(logits(0.5, 0.5), logits(0.25, 0.75)).item() == pytest.approx(0.5 * math.log(4 / 3))
 
 
 def test_k3_keeps_its_digits_near_ratio_1() -> None:
@@ -55,45 +51,16 @@ def test_entropies_by_hand() -> None:
     assert gaussian_entropy(torch.zeros(2)).item() == pytest.approx(math.log(2 * math.pi * math.e))
 
 
-def test_gaussian_kl_by_hand() -> None:
-    # log(2 / 1) + (1 + 3^2) / (2 * 4) - 1/2 = log 2 + 0.75
-    zero, three, log_2 = torch.zeros(1), torch.tensor([3.0]), torch.tensor([math.log(2)])
-    assert gaussian_kl(three, zero, zero, log_2).item() == pytest.approx(math.log(2) + 0.75)
-
-
 def test_extreme_logits_are_certain_choices() -> None:
     certain = torch.tensor([[1000.0, -1000.0]], requires_grad=True)
     for entropy in (categorical_entropy(certain), bernoulli_entropy(certain)):
         assert entropy.item() == 0
         (gradient,) = torch.autograd.grad(entropy.sum(), certain)
         assert gradient.tolist() == [[0, 0]]
-    other = torch.zeros(1, 2)
-    assert categorical_kl(certain, other).item() == pytest.approx(math.log(2))
-    assert bernoulli_kl(certain, other).item() == pytest.approx(2 * math.log(2))
 
 
-def test_a_choice_that_q_cannot_make_is_infinitely_far() -> None:
-    masked = torch.tensor([0.0, -torch.inf])
-    assert categorical_kl(torch.zeros(2), masked).item() == math.inf
-    assert bernoulli_kl(torch.zeros(2), masked).item() == math.inf
-    assert categorical_kl(masked, torch.zeros(2)).item() == pytest.approx(math.log(2))
-
-
-@pytest.mark.parametrize(
-    ("function", "inputs"),
-    [
-        (k1, 1),
-        (k2, 1),
-        (k3, 1),
-        (categorical_entropy, 1),
-        (bernoulli_entropy, 1),
-        (gaussian_entropy, 1),
-        (categorical_kl, 2),
-        (bernoulli_kl, 2),
-        (gaussian_kl, 4),
-    ],
-)
-def test_gradients_agree_with_finite_differences(function, inputs: int) -> None:
+@pytest.mark.parametrize("function", [k1, k2, k3, categorical_entropy, bernoulli_entropy, gaussian_entropy])
+def test_gradients_agree_with_finite_differences(function) -> None:
     generator = torch.Generator().manual_seed(0)
-    drawn = [torch.randn(2, 3, 4, generator=generator, dtype=torch.float64) for _ in range(inputs)]
-    assert torch.autograd.gradcheck(function, [x.requires_grad_() for x in drawn])
+    drawn = torch.randn(2, 3, 4, generator=generator, dtype=torch.float64)
+    assert torch.autograd.gradcheck(function, [drawn.requires_grad_()])

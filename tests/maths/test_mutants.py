@@ -185,13 +185,13 @@ MUTANTS = (
         "logp",
     ),
     Mutant("entropy is not normalised", "divergence.py", "logp = logits.log_softmax(-1)", "logp = logits"),
-    Mutant("the Gaussians are swapped", "divergence.py", "log_std_p - log_std_q", "log_std_q - log_std_p"),
-    Mutant("the other Gaussian's scale", "divergence.py", "(-log_std_q).exp()", "(-log_std_p).exp()"),
+    Mutant("a Gaussian of variance std", "divergence.py", "(log_std + 0.5 +", "(0.5 * log_std + 0.5 +"),
+    Mutant("half of a bit", "divergence.py", "softplus(finite) - p * finite", "softplus(finite)"),
     Mutant(
-        "half of a bit",
+        "a masked bit is a fair one",
         "divergence.py",
-        "torch.where(masked, 0.0, ones + zeros)",
-        "torch.where(masked, 0.0, ones)",
+        "torch.where(certain, 0.0, entropies)",
+        "entropies",
     ),
     Mutant("the sum counts masked steps", "statistics.py", "torch.where(mask, x, 0.0).sum()", "x.sum()"),
     Mutant(

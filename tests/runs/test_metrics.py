@@ -60,6 +60,7 @@ LANGUAGE = [
     "objective/rlhf_reward",
     "objective/non_score_reward",
     "objective/entropy",
+    "objective/entropy_exact",
     "objective/entropy_token_mean",
     "objective/response_length",
     "objective/eos_fraction",

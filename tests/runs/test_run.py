@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from tightrope.runs import checkpoint
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY
+from tightrope.runs.lock import WriterLock
 from tightrope.runs.records import dumps, plain, read_json, read_lines, write_json
 from tightrope.runs.run import Run
+from tightrope.runs.signed import signed
 
 SETTINGS = {"env": "CartPole-v1", "hidden": (64, 64), "clip": 0.2}
 
@@ -33,7 +35,9 @@ def test_settings_are_there_before_the_first_step(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", SETTINGS, "name")
     found = json.loads((run.path / "settings.json").read_text())
     assert found.pop("sha256") and found == {**SETTINGS, "hidden": [64, 64]}
-    assert Run.open(run.path, own=True).settings == run.settings
+    run.close()
+    with Run.open(run.path, own=True) as again:
+        assert again.settings == run.settings
 
 
 def test_a_changed_digit_of_the_settings_is_found(tmp_path: Path) -> None:
@@ -41,6 +45,7 @@ def test_a_changed_digit_of_the_settings_is_found(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", {"clip": 0.25, "steps": 3000, "lr": 1e-3}, "name")
     file = run.path / "settings.json"
     text, found = file.read_text(), 0
+    run.close()
     for place, letter in enumerate(text):
         if letter.isdigit() and place < text.index("sha256"):
             file.write_text(text[:place] + str((int(letter) + 1) % 10) + text[place + 1 :])
@@ -50,7 +55,27 @@ def test_a_changed_digit_of_the_settings_is_found(tmp_path: Path) -> None:
             found += 1
     assert found >= 7
     run.update_settings({"steps": 7000})
-    assert Run.open(run.path, own=True).settings == {"steps": 7000}
+    run.close()
+    with Run.open(run.path, own=True) as again:
+        assert again.settings == {"steps": 7000}
+
+
+def test_who_goes_on_reads_the_settings_behind_the_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The writer before changes the settings at the last moment: nobody sees those of before."""
+    run = Run.create(tmp_path / "a", {"steps": 3000}, "name")
+    run.close()
+    real = WriterLock.__init__
+
+    def late(self: WriterLock, folder: Path) -> None:
+        real(self, folder)
+        write_json(folder / "settings.json", signed({"steps": 7000}))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(WriterLock, "__init__", late)
+        with Run.open(run.path, own=True) as again:
+            assert again.settings == {"steps": 7000}
 
 
 def test_default_folders_differ_and_are_safe_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

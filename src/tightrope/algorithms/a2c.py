@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from tightrope.algorithms.settings import A2CSettings
 from tightrope.maths import statistics, surrogate, values
 
 Model = Callable[[Batch], Evaluation]
-ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Tensor]]]
+ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Any]]]
 
 
 def update(
@@ -34,18 +35,22 @@ def update(
     rng: np.random.Generator,
     *,
     extra_loss: ExtraLoss | None = None,
+    draw: Callable[[Batch], Batch] | None = None,
     refresh: Callable[[Batch], Batch] | None = None,
     log_ratio_limit: float | None = None,
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout by one step; returns the metrics.
 
-    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics [B, T])``:
-    the loss is a sum over the part / ``count``, the counting steps of the whole batch, as the rest is.
+    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics)``:
+    the loss is a sum over the part / ``count``, the counting steps of the whole batch, as the rest is; the
+    metrics are [B, T], or a sum and the number of its terms.
+    ``draw(batch) -> batch`` adds inputs that are drawn at random, once: a pass may be repeated.
     ``rng`` and ``refresh`` are not needed: there is one pass, in the order of the rollout.
-    Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the log-ratios exceed
-    ``log_ratio_limit``.
+    Rows without a counting step are left out. Raises ValueError when no step counts, NonFiniteError before a
+    step with a bad gradient, SamplingMismatch when the log-ratios exceed ``log_ratio_limit``.
     """
     meter, brake, batch = Meter(), Brake(batch.mask.device), batch.cleared()
+    batch = batch if draw is None else draw(batch)
     if settings.normalise_advantages:
         advantages = statistics.standardise(batch.advantages, batch.mask)
         batch = dataclasses.replace(batch, advantages=advantages)

@@ -62,10 +62,24 @@ class Batch:
         return steps if bool(steps.mask.all()) else steps.select(steps.mask[:, 0].nonzero()[:, 0])
 
     def cleared(self) -> Batch:
-        """The same with 0 in every number outside the mask: padding may hold anything, NaN included."""
+        """What an update learns from: the rows in which a step counts, with 0 in every number outside the
+        mask; padding may hold anything, NaN included. ValueError when no step counts.
+        """
+        self.require_steps()
+        rows = self.mask.any(1)
+        batch = self if bool(rows.all()) else self.select(rows.nonzero()[:, 0])
         names = ("old_logp", "old_values", "advantages", "returns")
-        numbers: dict[str, Any] = {n: torch.where(self.mask, getattr(self, n), 0.0) for n in names}
-        return dataclasses.replace(self, **numbers)
+        numbers: dict[str, Any] = {n: torch.where(batch.mask, getattr(batch, n), 0.0) for n in names}
+        return dataclasses.replace(batch, **numbers)
+
+    def require_steps(self) -> None:
+        """ValueError when no step counts: a mean over nothing is no loss."""
+        if not bool(self.mask.any()):
+            raise ValueError(
+                f"No step of the batch counts: its mask, of shape {tuple(self.mask.shape)}, is "
+                f"{'False throughout' if self.mask.numel() else 'empty'}; expected at least one True. Leave "
+                "the update out where a rollout has nothing to learn from."
+            )
 
     def minibatches(self, size: int, rng: np.random.Generator) -> Iterator[Batch]:
         """All rows once, in a fresh random order, ``size`` at a time; a smaller last one is used as it is."""

@@ -32,6 +32,19 @@ def free() -> None:
         torch.cuda.empty_cache()
 
 
+def _random_state() -> Callable[[], None]:
+    """Puts the state of torch's own generators, CPU and CUDA, back to what it is now."""
+    cpu = torch.get_rng_state()
+    cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+
+    def put_back() -> None:
+        torch.set_rng_state(cpu)
+        for index, state in enumerate(cuda):
+            torch.cuda.set_rng_state(state, index)
+
+    return put_back
+
+
 class Parts:
     """Consecutive parts of at most ``size`` rows (None: whole) in which gradients are summed up.
 
@@ -62,8 +75,12 @@ class Parts:
         self, rows: int, attempt: Callable[[int | None], Any], optimiser: torch.optim.Optimizer
     ) -> Any:
         """What ``attempt(size)`` gives, which computes a gradient over ``rows`` rows from nothing, ``size``
-        at a time; once more at half the size when memory runs out.
+        at a time; once more at half the size when memory runs out, with torch's random numbers from the same
+        state on.
+
+        Whatever else ``attempt`` changes it must set anew: draw and count outside of it.
         """
+        start_over = _random_state()
         while True:
             try:
                 return attempt(self.size)
@@ -77,6 +94,7 @@ class Parts:
             optimiser.zero_grad(set_to_none=True)
             self.size, self.halvings = (now + 1) // 2, self.halvings + 1
             free()
+            start_over()
 
     def metrics(self) -> dict[str, float]:
         """The size in force and how often it was halved; nothing while memory sufficed."""

@@ -93,12 +93,16 @@ class Meter:
         self._sums: dict[str, Tensor] = {}
         self._counts: dict[str, Tensor | float] = {}
         self._extremes: dict[str, Tensor] = {}
-        self.last: dict[str, Tensor] = {}
 
-    def add(self, mask: Tensor, **per_step: Tensor) -> None:
-        """Add [B, T] quantities; steps outside the mask do not count. ``last`` holds the newest sums."""
+    def add(self, mask: Tensor, **per_step: Tensor | tuple[Tensor, float]) -> None:
+        """Add [B, T] quantities; steps outside the mask do not count. A pair is a sum over other things than
+        steps, and their number.
+        """
         for name, x in per_step.items():
-            self.add_sum(name, statistics.masked_sum(x.detach().float(), mask), mask.sum())
+            if isinstance(x, tuple):
+                self.add_sum(name, x[0].detach().float(), x[1])
+            else:
+                self.add_sum(name, statistics.masked_sum(x.detach().float(), mask), mask.sum())
 
     def add_sum(self, name: str, total: Tensor, count: Tensor | float) -> None:
         """Add a sum and the number of things summed."""
@@ -136,8 +140,9 @@ def book_ratios(meter: Meter, log_ratio: Tensor, mask: Tensor, clip: float, clip
     kl = divergence.k3(log_ratio).detach()
     meter.add(mask, approx_kl=kl, clip_fraction=high | low, clip_fraction_high=high, clip_fraction_low=low)
     ratio = log_ratio.detach().exp()
-    meter.extreme("ratio_min", ratio, largest=False)
-    meter.extreme("ratio_max", ratio, largest=True)
+    # a masked step has the ratio 1, which is no ratio of the update
+    meter.extreme("ratio_min", torch.where(mask, ratio, torch.inf), largest=False)
+    meter.extreme("ratio_max", torch.where(mask, ratio, 0.0), largest=True)
     return statistics.masked_sum(kl, mask)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from tightrope.algorithms.settings import PPOSettings
 from tightrope.maths import statistics, surrogate, values
 
 Model = Callable[[Batch], Evaluation]
-ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Tensor]]]
+ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Any]]]
 
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, settings: PPOSettings) -> Tensor:
@@ -60,16 +61,19 @@ def update(
     rng: np.random.Generator,
     *,
     extra_loss: ExtraLoss | None = None,
+    draw: Callable[[Batch], Batch] | None = None,
     refresh: Callable[[Batch], Batch] | None = None,
     log_ratio_limit: float | None = None,
 ) -> dict[str, float]:
     """Improve ``model`` on one rollout; returns the metrics, means over every minibatch.
 
-    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics [B, T])``:
-    the loss is a sum over the part / ``count``, the counting steps of the whole minibatch, as the rest is.
+    ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics)``:
+    the loss is a sum over the part / ``count``, the counting steps of the whole minibatch, as the rest is;
+    the metrics are [B, T], or a sum and the number of its terms.
+    ``draw(minibatch) -> minibatch`` adds inputs that are drawn at random, once: a pass may be repeated.
     ``refresh(batch) -> batch`` estimates advantages anew when ``recompute_advantages`` is on.
-    Raises NonFiniteError before a step with a bad gradient, SamplingMismatch when the first log-ratios exceed
-    ``log_ratio_limit``.
+    Rows without a counting step are left out. Raises ValueError when no step counts, NonFiniteError before a
+    step with a bad gradient, SamplingMismatch when the first log-ratios exceed ``log_ratio_limit``.
     """
     meter, brake, batch = Meter(), Brake(batch.mask.device), batch.cleared()
     clip_high = settings.clip if settings.clip_high is None else settings.clip_high
@@ -79,6 +83,7 @@ def update(
             batch = refresh(batch).cleared()
         for minibatch in batch.minibatches(settings.minibatch_size, rng):
             number += 1
+            minibatch = minibatch if draw is None else draw(minibatch)
             if settings.normalise_advantages:
                 advantages = statistics.standardise(minibatch.advantages, minibatch.mask)
                 minibatch = dataclasses.replace(minibatch, advantages=advantages)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from tightrope.control.spaces import ActionLayout, Component
+from tightrope.maths import divergence
 
 LOG_STD_RANGE = (-20.0, 2.0)
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -91,22 +92,15 @@ class Distribution:
         for component in self.layout.components:
             if component.kind == "gaussian":
                 mean, log_std = self._gaussian(component)
-                entropy = (log_std + 0.5 + _HALF_LOG_2PI).expand_as(mean)
+                each = divergence.gaussian_entropy(log_std[..., None]).expand_as(mean)
                 if self.half_range is not None:
                     slope = _expected_log_tanh_slope(mean, log_std)
-                    entropy = entropy + slope + self._half_range(component).log()
-                total = total + entropy.sum(1)
+                    each = each + slope + self._half_range(component).log()
+                total = total + each.sum(1)
             elif component.kind == "bernoulli":
-                logits = self._logits(component)
-                finite = torch.where(torch.isinf(logits), 0.0, logits)
-                p = torch.sigmoid(finite)
-                each = functional.softplus(finite) - p * finite
-                total = total + torch.where(torch.isinf(logits), 0.0, each).sum(1)
+                total = total + divergence.bernoulli_entropy(self._logits(component))
             else:
-                logp = torch.log_softmax(self._logits(component), dim=1)
-                allowed = torch.isfinite(logp)
-                logp = torch.where(allowed, logp, 0.0)
-                total = total - torch.where(allowed, logp.exp() * logp, 0.0).sum(1)
+                total = total + divergence.categorical_entropy(self._logits(component))
         return total
 
     def _logits(self, component: Component) -> Tensor:

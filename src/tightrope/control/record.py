@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,20 +37,39 @@ def record_run(
     """
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ValueError("Writing mp4 needs imageio-ffmpeg. Install it: pip install 'tightrope[video]'.")
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame without a display
-        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo without one; read when it is first imported
     from tightrope.control.saving import load
 
-    agent = load(path, env=env, policy=policy, best=best, engine="torch")  # nothing is learnt
-    try:
+    with (
+        _headless(),
+        contextlib.closing(
+            load(path, env=env, policy=policy, best=best, engine="torch")  # nothing is learnt
+        ) as agent,
+    ):
         task = _renderable(agent.env, agent.settings.env)
         target = Path(out) if out is not None else Path(path) / "videos" / f"step-{agent.steps:012d}.mp4"
         target.parent.mkdir(parents=True, exist_ok=True)
         returns, frames = _play(agent, task, target, episodes, EVALUATION_SEED if seed is None else seed)
-    finally:
-        agent.close()
     return {"path": str(target), "frames": frames, "returns": returns, "step": agent.steps}
+
+
+@contextlib.contextmanager
+def _headless() -> Iterator[None]:
+    """On Linux without a display, pygame and MuJoCo draw without one inside; the environment variables that
+    say so go again afterwards.
+    """
+    ours: dict[str, str] = {}
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        wanted = {
+            "SDL_VIDEODRIVER": "dummy",
+            "MUJOCO_GL": "egl",
+        }  # MuJoCo's is read when it is first imported
+        ours = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(ours)
+    try:
+        yield
+    finally:
+        for name in ours:
+            os.environ.pop(name, None)
 
 
 def _renderable(env: Any, name: str) -> gym.Env:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,35 +26,26 @@ from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.grid import crosses
 from tightrope.runs.history import steps_in
+from tightrope.runs.report import Reporter, say, silent, teller, warn
 from tightrope.runs.rollback import rolling_back
-from tightrope.runs.run import Run, teller
+from tightrope.runs.run import Run
 
 __all__ = ["resolve", "resume", "train"]
-
-Reporter = Callable[[str, dict[str, Any]], None]
-
-
-def _silent(event: str, data: dict[str, Any]) -> None:
-    """The reporter that says nothing."""
-
-
-def _notice(report: Reporter) -> Callable[[str], None]:
-    return lambda text: report("line", {"text": text})
 
 
 def train(
     settings: TrainSettings,
     *,
     run_dir: str | Path | None = None,
-    report: Reporter = _silent,
+    report: Reporter = silent,
     env: Any = None,
     policy: Any = None,
 ) -> dict[str, Any]:
     """Train from the start; returns the summary that is also written to the run folder."""
     for risk in settings.risks():
-        report("line", {"text": f"warning: {risk}"})
+        warn(report, risk)
     source = settings.env if env is None else env
-    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=_notice(report))
+    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=teller(report))
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
     with Run.create(run_dir, settings_to_json(settings), name, tensorboard=settings.tensorboard) as run:
@@ -68,7 +59,7 @@ def resume(
     run_dir: str | Path,
     *,
     total_steps: int | None = None,
-    report: Reporter = _silent,
+    report: Reporter = silent,
     env: Any = None,
     policy: Any = None,
 ) -> dict[str, Any]:
@@ -77,20 +68,14 @@ def resume(
 
     ``total_steps`` extends a finished run: schedules and grid run over the new budget from here on.
     """
-    with Run.open(run_dir, own=True).lock() as run:
+    with Run.open(run_dir, own=True) as run:
         return _resume(run, total_steps, report, env, policy)
 
 
 def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, policy: Any) -> dict[str, Any]:
     run_dir = run.path
     if not steps_in(run.checkpoints) and run.read_metrics():
-        report(
-            "line",
-            {
-                "text": f"warning: {run_dir} has rows and no checkpoint; it begins at step 0 again.",
-                "warning": True,
-            },
-        )
+        warn(report, f"{run_dir} has rows and no checkpoint; it begins at step 0 again.")
     point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
@@ -112,7 +97,7 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
             total_steps = int(run.settings["total_steps"])
     settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
-    more = {"policy": policy, "settings": settings, "notify": _notice(report)}
+    more = {"policy": policy, "settings": settings, "notify": teller(report)}
     agent = rebuild(source, run_dir, command="resume", **more)
     if point is not None:
         with understood(point.folder):
@@ -121,14 +106,11 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
                 raise ValueError(f"its steps are {agent.steps}, its name says {step_of(point.folder)}")
             lines = resume_episodes(agent, state)
         for line in lines:
-            report("line", {"text": line})
+            teller(report)(line)
     run.rewind(point)
     run.update_settings(settings_to_json(agent.settings))
     if agent.steps + settings.num_envs > settings.total_steps:
-        report(
-            "line",
-            {"text": f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there."},
-        )
+        say(report, f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there.")
     return _continue(agent, run, settings.total_steps, report, best=best, wall=wall)
 
 
@@ -138,7 +120,7 @@ def _continue(
     """The loop: update -> record -> evaluate -> save, until the budget is spent."""
     settings, begin, wall_before = agent.settings, agent.steps, wall
     evaluator = _Evaluator(agent, run, report, best)
-    report("start", _start(agent, run))
+    report("start", _start(agent, run, total_steps))
     try:
         with signals.stoppable():
             clock = time.perf_counter()
@@ -187,7 +169,7 @@ def _updates(agent: Agent, run: Run, total_steps: int, report: Reporter) -> Iter
         yield progress
 
 
-def _start(agent: Agent, run: Run) -> dict[str, Any]:
+def _start(agent: Agent, run: Run, total_steps: int) -> dict[str, Any]:
     settings, environments = agent.settings, agent.environments
     workers = f" in {environments.num_workers} processes" if environments.backend == "workers" else ""
     who = f"environments: {environments.num_envs} x {settings.env}, {environments.backend}{workers}"
@@ -197,6 +179,7 @@ def _start(agent: Agent, run: Run) -> dict[str, Any]:
         "run_dir": str(run.path),
         "lines": lines,
         "step": agent.steps,
+        "total_steps": total_steps,
     }
 
 
@@ -221,7 +204,7 @@ class _Evaluator:
             episodes = agent.settings.evaluation_episodes
             self.environments = evaluation_environments(agent.env, agent.settings, episodes)
         except ValueError as error:
-            report("line", {"text": f"no evaluation while training: {error}"})
+            say(report, f"no evaluation while training: {error}")
             return
         if self.environments.gives_state:
             # what a copy keeps from one evaluation to the next must not change what a resumed run sees
@@ -252,8 +235,7 @@ class _Evaluator:
             with signals.whole():
                 save_agent(self.agent, self.run.best)
         except CannotWrite as error:
-            text = f"warning: The best policy is not saved: {error.what} {error.advice}. Training goes on."
-            self.report("line", {"text": text})
+            warn(self.report, f"The best policy is not saved: {error.what} {error.advice}. Training goes on.")
         else:
             self.best = mean
 

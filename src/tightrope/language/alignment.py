@@ -11,9 +11,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from tightrope.language.fitting import Reporter, silent
+from tightrope.language.fitting import threads
 from tightrope.language.kl import bias_of
 from tightrope.language.quiet import quiet
 from tightrope.language.saving import restore_state
@@ -21,7 +19,8 @@ from tightrope.language.settings import NOT_HERE, AlignSettings
 from tightrope.language.trainer import Aligned, Trainer
 from tightrope.runs.history import steps_in
 from tightrope.runs.records import retyped
-from tightrope.runs.run import Run, teller
+from tightrope.runs.report import Reporter, say, silent, teller, warn
+from tightrope.runs.run import Run
 
 __all__ = ["Aligned", "align", "resume_align"]
 
@@ -47,22 +46,18 @@ def align(
     """
     settings = (settings or AlignSettings()).with_values(**_named(prompts, reward, gold), **values)
     for risk in settings.risks():
-        report("line", {"text": f"warning: {risk}", "warning": True})
+        warn(report, risk)
     if (bias := bias_of(settings.kl)) is not None:
-        report("line", {"text": f"warning: {bias}.", "warning": True})
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
-    trainer = Trainer(
-        settings,
+        warn(report, f"{bias}.")
+    sources = (
         settings.data if prompts is None else prompts,
         settings.reward if reward is None else reward,
         settings.gold if gold is None else gold,
-        report,
     )
-    run = Run.create(
-        run_dir, dataclasses.asdict(trainer.settings), f"align-{Path(settings.model).name}-{settings.seed}"
-    )
-    return trainer.run(run)
+    with threads(settings.threads):
+        trainer = Trainer(settings, *sources, report)
+        name = f"align-{Path(settings.model).name}-{settings.seed}"
+        return trainer.run(Run.create(run_dir, dataclasses.asdict(trainer.settings), name))
 
 
 def _named(prompts: Any, reward: Any, gold: Any) -> dict[str, str]:
@@ -96,10 +91,26 @@ def resume_align(
     Code is never named by a file: a reward that was a function must be given again, and prompts that were no
     file too. ``total_episodes`` extends a finished run.
     """
-    run = Run.open(run_dir, own=True)
-    settings = settings_from_json(run.settings)
-    if total_episodes is not None:
-        settings = settings.with_values(total_episodes=total_episodes)
+    with Run.open(run_dir, own=True) as run:
+        settings = settings_from_json(run.settings)
+        if total_episodes is not None:
+            settings = settings.with_values(total_episodes=total_episodes)
+        _require_what_no_file_gives(run_dir, settings, prompts, reward, gold)
+        sources = (
+            settings.data if prompts is None else prompts,
+            settings.reward if reward is None else reward,
+            settings.gold if gold is None else gold,
+        )
+        with threads(settings.threads):
+            trainer = Trainer(settings, *sources, report)
+            _go_back(trainer, run, total_episodes)
+            return trainer.run(run)
+
+
+def _require_what_no_file_gives(
+    run_dir: str | Path, settings: AlignSettings, prompts: Any, reward: Any, gold: Any
+) -> None:
+    """ValueError for prompts and judges that were objects and are not given again."""
     for name, value in (("reward", reward), ("gold", gold)):
         known = getattr(settings, name)
         if value is None and known not in (None, "length") and not Path(known).is_dir():
@@ -113,30 +124,25 @@ def resume_align(
             f"The prompts of {run_dir} were {settings.data!r}, which is no file. Give them again: "
             f"tightrope resume {shlex.quote(str(run_dir))} --data PROMPTS.jsonl"
         )
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
-    sources = (
-        settings.data if prompts is None else prompts,
-        settings.reward if reward is None else reward,
-        settings.gold if gold is None else gold,
-    )
-    with run.lock():
-        trainer = Trainer(settings, *sources, report)
-        point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
-        if point is not None:
-            restore_state(trainer, point)
-        if total_episodes is not None and total_episodes < trainer.episodes:
-            raise ValueError(
-                f"{run_dir} has had {trainer.episodes:,} responses already; expected total_episodes of as "
-                f"many or more, got {total_episodes:,}."
-            )
-        if point is not None and trainer.episodes >= settings.total_episodes:
-            text = f"{run_dir} has its {trainer.episodes:,} responses; --total-episodes N goes on from there."
-            report("line", {"text": text})
-        trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
-        run.rewind(point)
-        run.update_settings(dataclasses.asdict(settings))
-        return trainer.run(run)
+
+
+def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
+    """Put trainer and run to the newest checkpoint, or to the start where there is none."""
+    settings, report = trainer.settings, trainer.report
+    point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
+    if point is not None:
+        restore_state(trainer, point)
+    if total_episodes is not None and total_episodes < trainer.episodes:
+        raise ValueError(
+            f"{run.path} has had {trainer.episodes:,} responses already; expected total_episodes of as "
+            f"many or more, got {total_episodes:,}."
+        )
+    if point is not None and trainer.episodes >= settings.total_episodes:
+        text = f"{run.path} has its {trainer.episodes:,} responses; --total-episodes N goes on from there."
+        say(report, text)
+    trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
+    run.rewind(point)
+    run.update_settings(dataclasses.asdict(settings))
 
 
 def settings_from_json(data: dict[str, Any]) -> AlignSettings:

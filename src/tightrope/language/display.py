@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, TextIO
 
 from tightrope.language.samples import print_samples, spread
+from tightrope.runs.report import shown
 
 SAMPLES = 3  # responses of a table: the best score, the middle and the worst
 ROWS = 20  # lines of a run that is not watched on a terminal
@@ -72,11 +73,7 @@ class Display:
             for line in data.get("lines", ()):
                 self._say(str(line))
         elif event == "line":
-            text = str(data["text"])
-            if text.startswith("warning:"):
-                self._warn(text)
-            else:
-                self._say(text)
+            (self._warn if data["warning"] else self._say)(shown(data))
         elif event == "update":
             self._update(data)
         elif event == "samples" and not self._quiet:

@@ -42,19 +42,10 @@ from tightrope.language.settings import SupervisedSettings
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.grid import crosses
-from tightrope.runs.run import Run, teller
+from tightrope.runs.report import Reporter, say, teller
+from tightrope.runs.run import Run
 
 Item = TypeVar("Item")
-Reporter = Callable[[str, dict[str, Any]], None]
-
-
-def silent(event: str, data: dict[str, Any]) -> None:
-    """The reporter that says nothing."""
-
-
-def warner(report: Reporter) -> Callable[[str], None]:
-    """Reports a text as a warning."""
-    return lambda text: report("line", {"text": f"warning: {text}", "warning": True})
 
 
 class Loaded(NamedTuple):
@@ -95,7 +86,7 @@ def present_memory(settings: SupervisedSettings, given: tuple[Any, Any] | None, 
     weights = [] if given is None else [p for p in given[0].parameters() if p.device.type == place.type]
     config = pretrained(AutoConfig, find_model(settings.model)) if given is None else given[0].config
     found, available = ledger(config, job_of(settings)), available_memory(place)
-    report("line", {"text": found.text()})
+    say(report, found.text())
     check(found, None if available is None else available + sum(p.nbytes for p in weights))
 
 

@@ -4,10 +4,13 @@ tax.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from tightrope.algorithms.batch import Batch
 from tightrope.language.data import Example, Notify, pad_right, read_rows, sft_examples
 from tightrope.language.roles import Roles
 from tightrope.language.settings import AlignSettings
@@ -33,14 +36,21 @@ class Pretraining:
         )
         return cls(roles, examples, settings.ptx_per_response, settings.seed)
 
-    def loss(self, responses: int) -> tuple[Tensor, int]:
-        """-log p summed over fresh texts, ``per_response`` for each of ``responses``, and their tokens.
+    def draw(self, minibatch: Batch) -> Batch:
+        """The minibatch with fresh texts beside its responses: their numbers in the input ``ptx``,
+        [B, per_response].
 
-        The texts do not depend on how responses are split into calls.
+        They travel with the responses, so that they are the same however these are split, and in a pass that
+        is repeated.
         """
+        shape = len(minibatch), self.per_response
+        chosen = torch.from_numpy(self.rng.integers(len(self.examples), size=shape))
+        return dataclasses.replace(minibatch, inputs={**minibatch.inputs, "ptx": chosen})
+
+    def loss(self, chosen: Tensor) -> tuple[Tensor, int]:
+        """-log p summed over the texts of these numbers, and their tokens."""
         device = next(self.roles.model.parameters()).device
-        chosen = self.rng.integers(len(self.examples), size=responses * self.per_response)
-        picked = [self.examples[int(i)] for i in chosen]
+        picked = [self.examples[i] for i in chosen.flatten().tolist()]
         tokens, real = (x.to(device) for x in pad_right([example.tokens for example in picked]))
         learn = torch.zeros_like(real)
         for row, example in enumerate(picked):

@@ -22,15 +22,12 @@ from tightrope.language.data import Pair, pad_right, preference_pairs, read_rows
 from tightrope.language.fitting import (
     Loaded,
     Objective,
-    Reporter,
     fit,
     hold_out,
     micro_batches,
     precision,
     prepared,
-    silent,
     training_rows,
-    warner,
 )
 from tightrope.language.models import fused, load_tokenizer, parts, without_dropout
 from tightrope.language.quiet import quiet
@@ -39,6 +36,7 @@ from tightrope.language.reward_saving import SHIFT, reward_skeleton, save_reward
 from tightrope.language.sampling import positions
 from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised import announcement, finish, opened, recorded, reopened
+from tightrope.runs.report import Reporter, silent, warner
 
 DEMONSTRATIONS = 1024  # texts on which scores are normalised, at most
 BINS = 10

@@ -26,8 +26,9 @@ from tightrope.language.settings import AlignSettings
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.durable import whole
 from tightrope.runs.history import Checkpoint, steps_in
+from tightrope.runs.report import teller
 from tightrope.runs.rollback import rolling_back
-from tightrope.runs.run import Run, teller
+from tightrope.runs.run import Run
 
 if TYPE_CHECKING:
     from tightrope.language.trainer import Trainer

@@ -17,15 +17,12 @@ from tightrope.language.data import Example, Row, read_rows, sft_examples
 from tightrope.language.fitting import (
     Loaded,
     Objective,
-    Reporter,
     fit,
     hold_out,
     micro_batches,
     precision,
     prepared,
-    silent,
     training_rows,
-    warner,
 )
 from tightrope.language.models import attention_window, parts
 from tightrope.language.packing import Packed, attention_of, collate, pack, row_of
@@ -35,6 +32,7 @@ from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised import announcement, finish, opened, recorded, reopened
 from tightrope.language.token_stats import Sampling, token_statistics
 from tightrope.runs.durable import whole
+from tightrope.runs.report import Reporter, silent, warner
 
 PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
 

@@ -13,9 +13,10 @@ from typing import Any, TypeVar
 
 from torch import nn
 
-from tightrope.language.fitting import Loaded, Reporter
+from tightrope.language.fitting import Loaded
 from tightrope.language.models import parameter_counts
 from tightrope.language.settings import SupervisedSettings
+from tightrope.runs.report import Reporter
 from tightrope.runs.run import Run
 
 Settings = TypeVar("Settings", bound=SupervisedSettings)
@@ -40,6 +41,14 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
     it has another writer.
     """
     run = Run.open(run_dir, own=True)
+    try:
+        return run, _settings_again(kind, run, run_dir, given)
+    except BaseException:
+        run.close()
+        raise
+
+
+def _settings_again(kind: type[Settings], run: Run, run_dir: str | Path, given: dict[str, Any]) -> Settings:
     unknown = sorted(set(run.settings) - {field.name for field in dataclasses.fields(kind)})
     if unknown:
         raise ValueError(f"{run_dir} has settings that {kind.__name__} has not: {', '.join(unknown)}.")
@@ -51,7 +60,7 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
                 f"The {name} of {run_dir} was {run.settings[name]}, an object that no file holds. Give it "
                 f"again: {name}=... in Python{command}."
             )
-    return run.lock(), recorded(kind(**run.settings), **given)
+    return recorded(kind(**run.settings), **given)
 
 
 def opened(run: Run | str | Path | None, settings: SupervisedSettings, command: str) -> Run:

@@ -110,7 +110,7 @@ class _Chunked(torch.autograd.Function):
         for rows in chunks:
             p, logs, chosen = chunks.policy(rows)
             logp[rows] = logs.gather(1, chosen)[:, 0]
-            entropy[rows] = -_dot(p, logs)[:, 0]
+            entropy[rows] = -_dot(p, logs)[:, 0]  # in buffers: a test holds it to maths.divergence
             if reference is not None:
                 others = chunks.reference(rows)
                 theirs[rows] = others.gather(1, chosen)[:, 0]

@@ -31,7 +31,6 @@ from tightrope.language.collect import (
 )
 from tightrope.language.data import Prompt, hold_out, read_prompts, read_rows
 from tightrope.language.faults import refuse_bad_numbers, refuse_mismatch
-from tightrope.language.fitting import Reporter
 from tightrope.language.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.models import context_length, find_model
 from tightrope.language.monitor import Monitor
@@ -53,6 +52,7 @@ from tightrope.language.settings import AlignSettings
 from tightrope.maths.values import explained_variance
 from tightrope.runs import signals
 from tightrope.runs.grid import crosses
+from tightrope.runs.report import Reporter, teller, warn
 from tightrope.runs.run import Run
 
 
@@ -84,7 +84,7 @@ class Trainer:
         self.roles: Roles = make_roles(
             settings,
             on_trunk,
-            lambda text: report("line", {"text": text}),
+            teller(report),
             own_reward=on_trunk is None and is_folder(reward),
         )
         self.prompts = self._read_prompts(prompts)
@@ -123,7 +123,7 @@ class Trainer:
         return found
 
     def _warn(self, text: str) -> None:
-        self.report("line", {"text": f"warning: {text}", "warning": True})
+        warn(self.report, text)
 
     # ------------------------------------------------------------------------------------------ the loop
 
@@ -224,7 +224,8 @@ class Trainer:
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
         batch = to_batch(experience, rewards, valid, settings)
         share = kl_share(experience, settings, self.kl_beta)
-        metrics = describe(experience, scores, rewards, share, valid) | scores.metrics | gold
+        plain = rewards / self.reward_scale  # the metrics are those before whiten_rewards
+        metrics = describe(experience, scores, plain, share, valid) | scores.metrics | gold
         refuse_mismatch(metrics["objective/sampling_gap"], settings.dtype, first=not self.iteration)
         self._watch(metrics)
         judged = time.perf_counter()
@@ -270,9 +271,9 @@ class Trainer:
             kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
         extra = None if warming else self._extra_loss(kl_weight)
         present = present.unchecked(micro_batch_size=self.micro_batch_size)
-        metrics = ppo.update(
-            model, self.optimiser, batch, present, self.update_rng, extra_loss=extra, log_ratio_limit=limit
-        )
+        given = (model, self.optimiser, batch, present, self.update_rng)
+        draw = None if extra is None or self.pretraining is None else self.pretraining.draw
+        metrics = ppo.update(*given, extra_loss=extra, draw=draw, log_ratio_limit=limit)
         if "train/micro_batch_size" in metrics:
             self._smaller(int(metrics["train/micro_batch_size"]))
         return metrics
@@ -289,10 +290,8 @@ class Trainer:
         """The KL's share in the loss and the pretraining loss; None when neither is asked for."""
         form, pretraining = self.settings.kl, self.pretraining
 
-        def extra(
-            model: Any, part: Batch, now: Evaluation, count: Tensor
-        ) -> tuple[Tensor, dict[str, Tensor]]:
-            total, booked = now.logp.new_zeros(()), {}
+        def extra(model: Any, part: Batch, now: Evaluation, count: Tensor) -> tuple[Tensor, dict[str, Any]]:
+            total, booked = now.logp.new_zeros(()), dict[str, Any]()
             log_ratio = now.logp.detach() - part.old_logp
             kl = kl_loss(form, now.logp, part.inputs["ref_logp"], model.kl, part.mask, count, log_ratio)
             if kl is not None:
@@ -300,9 +299,9 @@ class Trainer:
                 booked["kl_loss"] = kl.detach() * count / part.mask.sum().clamp(min=1) * part.mask
             if pretraining is not None:
                 # a sum over the texts of one response beside a sum over the response, as in InstructGPT
-                loss, tokens = pretraining.loss(len(part))
+                loss, tokens = pretraining.loss(part.inputs["ptx"])
                 total = total + self.settings.ptx_weight * loss / (pretraining.per_response * count)
-                booked["ptx_loss"] = loss.detach() / tokens * part.mask
+                booked["ptx_loss"] = loss, tokens
             return total, booked
 
         return extra if not form.endswith("reward") or pretraining is not None else None

@@ -12,8 +12,8 @@ Two flags tell how a step ended, and they are not the same:
 `mask` is True where a step counts. Whatever lies in a masked step or behind a cut (NaN included) changes
 nothing, neither a value nor a gradient: cuts are `torch.where`, because 0 * NaN is NaN.
 
-Rewards, values and advantages share one unit. Source of GAE: Schulman et al. 2016,
-https://arxiv.org/abs/1506.02438
+Rewards, values and advantages share one unit. No rows or no steps give as many. Source of GAE: Schulman et
+al. 2016, https://arxiv.org/abs/1506.02438
 """
 
 import torch
@@ -63,10 +63,12 @@ def gae(
     length: VAPO, https://arxiv.org/abs/2504.05118). ValueError when the shapes differ.
     """
     require_same_shape(rewards=rewards, ended=ended)
+    deltas = td_errors(rewards, values, next_values, terminated, gamma, mask)
+    if not deltas.shape[1]:
+        return deltas
     if isinstance(gae_lambda, Tensor):
         require_same_shape(a_column_of_rewards=rewards[:, 0], gae_lambda=gae_lambda)
         gae_lambda = gae_lambda.to(rewards)
-    deltas = td_errors(rewards, values, next_values, terminated, gamma, mask)
     advantages = []
     trace = torch.zeros_like(deltas[:, 0])
     for t in reversed(range(deltas.shape[1])):
@@ -92,6 +94,8 @@ def discounted_returns(
     cut. None means 0 everywhere. ValueError when the shapes differ.
     """
     require_same_shape(rewards=rewards, ended=ended, bootstrap=bootstrap, mask=mask)
+    if not rewards.shape[1]:
+        return rewards
     tail = torch.zeros_like(rewards) if bootstrap is None else bootstrap
     returns = []
     future = tail[:, -1]
@@ -112,6 +116,8 @@ def next_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values
     do, `td_errors` drops it. ValueError when the shapes differ.
     """
     require_same_shape(values=values, ended=ended, final_values=final_values)
+    if not values.shape[1]:
+        return values
     require_same_shape(values_of_a_column=values[:, 0], last_values=last_values)
     shifted = torch.cat([values[:, 1:], last_values[:, None]], dim=1)
     return torch.where(ended, final_values, shifted)

@@ -51,19 +51,25 @@ LANGUAGE_TABLE = (
         "Mean score of the responses that count, as the reward gives it, before scaling, clipping and KL.",
         negative=True,
     ),
-    metric("objective/scores_std", "score", "any", "Standard deviation of the scores over responses."),
+    metric(
+        "objective/scores_std",
+        "score",
+        "any",
+        "Standard deviation of the scores over the responses that count.",
+    ),
     metric(
         "objective/rlhf_reward",
         "score",
         "up",
-        "Mean over responses of the sum of all rewards per step: what PPO maximises, score and KL penalty.",
+        "Mean over the responses that count of the sum of all rewards per step: what PPO maximises, score "
+        "and KL penalty, before whiten_rewards divides them.",
         negative=True,
     ),
     metric(
         "objective/non_score_reward",
         "score",
         "any",
-        "The part of objective/rlhf_reward that is no score: minus kl_beta times KL.",
+        "The part of objective/rlhf_reward that the KL penalty adds: minus kl_beta times KL.",
         negative=True,
     ),
     metric(
@@ -73,7 +79,18 @@ LANGUAGE_TABLE = (
         "-logp of the sampled tokens summed over each response, mean over responses; a fall to a fraction of "
         "the first value means that all responses become alike.",
     ),
-    metric("objective/entropy_token_mean", "nats/token", "any", "-logp, mean over response tokens."),
+    metric(
+        "objective/entropy_exact",
+        "nats",
+        "any",
+        "The same with the entropy of each step computed over the whole vocabulary: less noise.",
+    ),
+    metric(
+        "objective/entropy_token_mean",
+        "nats/token",
+        "any",
+        "-logp of the sampled tokens, mean over response tokens.",
+    ),
     metric("objective/response_length", "tokens", "any", "Mean tokens of a response, its EOS included."),
     metric(
         "objective/eos_fraction",
@@ -91,7 +108,8 @@ LANGUAGE_TABLE = (
         "objective/masked_samples",
         "responses",
         "down",
-        "Responses of this rollout that no reward could be given to and that do not train anything.",
+        "Responses of this rollout that do not train anything: no reward could be given to them, or with "
+        "critic none to no other response to their prompt.",
     ),
     metric(
         "objective/distinct_2",
@@ -121,7 +139,8 @@ LANGUAGE_TABLE = (
         "train/ptx_loss",
         "nats/token",
         "down",
-        "Language-modelling loss on pretraining text beside PPO (InstructGPT), before ptx_weight.",
+        "-logp of the tokens of pretraining text beside PPO (InstructGPT), mean over these tokens, before "
+        "ptx_weight.",
     ),
     metric("time/generate_seconds", "s", "down", "Seconds of this update that sampling responses took."),
     metric(

@@ -75,14 +75,16 @@ _TABLE = (
         "train/policy_gradient_loss",
         "advantage",
         "any",
-        "Mean clipped surrogate with the sign turned: minimised. Small and about 0; its size is no progress.",
+        "Mean policy term of the loss, for PPO the clipped surrogate with the sign turned: minimised. Small "
+        "and about 0; its size is no progress.",
         negative=True,
     ),
     metric(
         "train/value_loss",
         "return^2",
         "down",
-        "Half the critic's mean squared error; rises with the returns as a policy learns.",
+        "Half the critic's mean squared error, with value_clip the clipped one; rises with the returns as a "
+        "policy learns.",
     ),
     metric(
         "train/entropy",

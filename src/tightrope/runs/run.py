@@ -23,21 +23,14 @@ from tightrope.runs.records import (
     disagreement,
     dumps,
     plain,
-    printable,
-    read_json,
     read_lines,
     refuse_links,
     write_json,
 )
-from tightrope.runs.signed import require_own, signed, unsigned
+from tightrope.runs.signed import read_settings, signed
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-
-def teller(report: Callable[[str, dict[str, Any]], None]) -> Callable[[str], None]:
-    """What tells the user a text through the ``line`` event of a report; a warning when it begins so."""
-    return lambda text: report("line", {"text": printable(text), "warning": text.startswith("warning:")})
 
 
 class Run:
@@ -83,19 +76,25 @@ class Run:
     @classmethod
     def open(cls, path: str | Path, *, tensorboard: bool = False, own: bool = False) -> Run:
         """An existing run folder. Raises ValueError where there is none, naming a near one, and for links
-        inside it; with ``own`` also when settings.json is not as the run wrote it.
+        inside it.
+
+        ``own``: for whoever goes on with the run. The writer's lock is taken before anything is read, so that
+        no other writer changes what was read. Raises RunInUse where there is one, and ValueError when
+        settings.json is not as the run wrote it.
         """
         path = Path(path)
         if not (path / "settings.json").is_file():
             raise ValueError(f"{path} is not a run folder: {why_not(path)}")
         refuse_links(path)
-        settings = read_json(path / "settings.json")
-        if not isinstance(settings, dict):
-            raise ValueError(f"{path / 'settings.json'} holds {type(settings).__name__}, expected an object.")
+        run = cls(path, {}, _summary_writer()(str(path / "tensorboard")) if tensorboard else None)
         if own:
-            require_own(path / "settings.json", settings)
-        settings = unsigned(settings)
-        return cls(path, settings, _summary_writer()(str(path / "tensorboard")) if tensorboard else None)
+            run.lock()
+        try:
+            run.settings = read_settings(path / "settings.json", own=own)
+        except BaseException:
+            run.close()
+            raise
+        return run
 
     def lock(self) -> Run:
         """Become the one writer, until `close` or the end of the process; nothing when it is already.

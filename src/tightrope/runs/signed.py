@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.runs.checkpoint import fingerprint
+from tightrope.runs.records import read_json
 
 KEY = "sha256"
 
@@ -27,3 +28,15 @@ def require_own(file: Path, found: dict[str, Any]) -> None:
             f"{file} is not as the run wrote it: its sha256 is that of other settings, and the end would be "
             f"another run's. Put it back, or begin a new run of these settings: --settings {file}"
         )
+
+
+def read_settings(path: Path, *, own: bool) -> dict[str, Any]:
+    """The settings that a file holds, without their hash. ValueError when they are no object, and with
+    ``own`` when they are not as the run wrote them.
+    """
+    settings = read_json(path)
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path} holds {type(settings).__name__}, expected an object.")
+    if own:
+        require_own(path, settings)
+    return unsigned(settings)

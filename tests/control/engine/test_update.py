@@ -1,6 +1,7 @@
 """The compiled update is ppo.update: same parameters, metrics and permutations, whatever the settings."""
 
 import copy
+import dataclasses
 import os
 import subprocess
 import sys
@@ -169,6 +170,20 @@ def test_first_minibatch_check_sees_no_difference_and_changes_nothing():
     before = numbers(policy)
     assert engine.check_first_minibatch(batch, settings) < 1e-6
     assert difference(before, numbers(policy)) == 0.0
+
+
+def test_what_the_engine_does_not_know_and_a_batch_without_a_step_are_refused():
+    policy, optimiser, settings = make()
+    engine, batch = FusedEngine(policy, optimiser, 1), make_batch(policy)
+    before, rng = numbers(policy), np.random.default_rng(0)
+    for name in ("extra_loss", "draw"):
+        with pytest.raises(ValueError, match="extra_loss, draw, recompute_advantages"):
+            engine.update(policy, optimiser, batch, settings, rng, **{name: lambda x: x})
+    nothing = dataclasses.replace(batch, mask=batch.mask & False)
+    with pytest.raises(ValueError, match="No step of the batch counts"):
+        engine.update(policy, optimiser, nothing, settings, rng)
+    assert difference(before, numbers(policy)) == 0.0
+    engine.close()
 
 
 def test_unsupported_names_the_reason():

@@ -165,16 +165,18 @@ class FusedEngine:
         rng: np.random.Generator,
         *,
         extra_loss: Any = None,
+        draw: Any = None,
         refresh: Any = None,
         log_ratio_limit: float | None = None,
     ) -> dict[str, float]:
         """``ppo.update``: same permutations, metrics and errors; parameters equal within 1e-5."""
         if model is not self.policy or optimiser is not self.optimiser:
             raise ValueError("This engine was made for another policy or optimiser; make one for these.")
-        if extra_loss is not None or settings.recompute_advantages:
+        if extra_loss is not None or draw is not None or settings.recompute_advantages:
             raise ValueError(
-                "The compiled engine knows no extra_loss and no recompute_advantages; use ppo.update."
+                "The compiled engine knows no extra_loss, draw, recompute_advantages; use ppo.update."
             )
+        batch.require_steps()
         self.attach()
         rows, columns = _rows(batch), _columns(batch)
         run = _Run(self, columns, self._options(settings, log_ratio_limit))
