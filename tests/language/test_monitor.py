@@ -93,6 +93,14 @@ def test_the_order_of_the_points_does_not_matter_and_no_points_are_too_odd(point
         assert again.gold(kl) == pytest.approx(found.gold(kl), abs=1e-4 * spread)
 
 
+def test_points_that_are_too_much_alike_once_squared_are_named_and_raise_nothing():
+    """Least squares accepts them; the matrix of the draws, which squares its condition, does not."""
+    places = np.array([0.0, 14.0, 0.00048828125, 0.0007324218750000016, 0.00022870302200317423])
+    for last in np.linspace(0.9, 1.1, 41):
+        found = fit([(kl, 0.0) for kl in (*places[:4], places[4] * last)])
+        assert not found.reason or "alike" in found.reason
+
+
 @pytest.mark.parametrize("count", range(FEWEST_POINTS))
 def test_too_few_points_are_said_to_be_too_few(count):
     found = fit([(float(kl), curve(kl)) for kl in range(count)])

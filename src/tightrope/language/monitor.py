@@ -74,13 +74,17 @@ def fit(points: Sequence[tuple[float, float]]) -> Fit:
     columns = np.stack([d, bend, np.ones_like(d)], 1) * weights[:, None]
     size = np.linalg.norm(columns, axis=0)
     solution, _, rank, _ = np.linalg.lstsq(columns / size, gold * weights, rcond=1e-8)
+    alike = Fit(points=len(pairs), reason="the KLs of the points are too much alike")
     if rank < 3:
-        return Fit(points=len(pairs), reason="the KLs of the points are too much alike")
+        return alike
     alpha, beta, offset = solution / size
     left = gold * weights - columns @ (solution / size)
     squares, spread = float(left @ left), float(np.square(gold - gold.mean()).sum())
     unexplained = float(np.square(left / weights).sum())
-    tops = _possible_tops(columns / size, weights, solution, squares, size)
+    try:
+        tops = _possible_tops(columns / size, weights, solution, squares, size)
+    except np.linalg.LinAlgError:  # the draws square the condition number that lstsq has just accepted
+        return alike
     peak_d, high = float(_top(alpha, beta)), float(tops[-(DRAWS // 10)])
     return Fit(
         alpha=float(alpha),
