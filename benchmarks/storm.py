@@ -65,7 +65,7 @@ def letters(prompts: list[str], completions: list[str], **columns: Any) -> list[
 
 def language(folder: Path, report: Any) -> None:
     """PPO on a random Llama of two layers: value head, reference, KL controller, shuffled prompts."""
-    from tightrope.language.alignment import align, resume_align
+    from tightrope.language.alignment.align import align, resume_align
 
     prompts = ["".join(random.Random(k).choices("abcdefghijklmnop", k=1 + k % 5)) for k in range(11)]
     given = {"prompts": prompts, "reward": letters, "report": report}
@@ -299,8 +299,8 @@ def compare(story: str, wanted: dict[str, Any], found: dict[str, Any]) -> None:
 def cost(base: Path, steps: int) -> dict[str, Any]:
     """Seconds of a grid point of CartPole-v1 at default settings: save, sync, and environments anew."""
     from tightrope.control import train
-    from tightrope.control.collect import Collector
     from tightrope.control.resolve import resolve
+    from tightrope.control.rollout.collector import Collector
 
     spent = {"save": [], "reset": []}
 
@@ -374,13 +374,13 @@ def warm(story: str) -> None:
     if story == "language":
         import transformers
 
-        import tightrope.language.alignment
+        import tightrope.language.alignment.align
 
         transformers.utils.logging.disable_progress_bar()
     else:
         import gymnasium
 
-        import tightrope.control.engine.fused
+        import tightrope.control.engine.compiled.fused
         import tightrope.control.train  # noqa: F401
 
         gymnasium.make("CartPole-v1").close()

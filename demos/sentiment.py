@@ -171,8 +171,8 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
 
 
 def _display(columns: Any, what: str) -> Any:
-    from tightrope import panel
-    from tightrope.language.display import Display
+    from tightrope.cli import panel
+    from tightrope.cli.language_display import Display
 
     return Display(columns, what, sys.stdout, live=panel.can_live(sys.stdout, dict(os.environ)))
 
@@ -180,9 +180,9 @@ def _display(columns: Any, what: str) -> Any:
 def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, Any]) -> str:
     """Stage one: what a review sounds like."""
     if not (out / "sft" / "summary.json").exists():
-        from tightrope.language.display import SFT
+        from tightrope.cli.language_display import SFT
         from tightrope.language.settings import SFTSettings
-        from tightrope.language.sft import train_sft
+        from tightrope.language.supervised.sft import train_sft
 
         print("\n1. Supervised fine-tuning: the language of film reviews")
         rng = random.Random(4)
@@ -196,9 +196,9 @@ def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, A
 def _reward(out: Path, model: str, rows: list[tuple[str, int]], ends: float, values: dict[str, Any]) -> str:
     """Stage two: which of two texts is the better one."""
     if not (out / "reward" / "summary.json").exists():
-        from tightrope.language.display import REWARD
-        from tightrope.language.reward_model import train_reward
+        from tightrope.cli.language_display import REWARD
         from tightrope.language.settings import RewardSettings
+        from tightrope.language.supervised.preferences import train_reward
 
         print("\n2. Reward model: a stretch of praise is preferred to one of blame")
         settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **values)
@@ -212,8 +212,8 @@ def _align(
     values: dict[str, Any], model: str, reward: str, gold: Any, out: Path, prompts: list[str]
 ) -> tuple[Any, float, list[dict[str, Any]]]:
     """Stage three: PPO. Also returns the warnings it gave, and after how many responses."""
-    from tightrope.language.alignment import align
-    from tightrope.language.display import ALIGN
+    from tightrope.cli.language_display import ALIGN
+    from tightrope.language.alignment.align import align
 
     print("\n3. PPO towards what the reward model prefers, held near the reference by the KL")
     begin, alarms, step = time.perf_counter(), list[dict[str, Any]](), 0
@@ -235,9 +235,9 @@ def _align(
 def _summary(
     options: Any, run: Any, seconds: float, alarms: list[dict[str, Any]], gold: Any, prompts: list[str]
 ) -> dict[str, Any]:
-    from tightrope import panel
-    from tightrope.language.evaluate import sample_run
-    from tightrope.language.samples import print_comparison
+    from tightrope.cli import panel
+    from tightrope.language.alignment.samples import print_comparison
+    from tightrope.language.compare import sample_run
 
     names = ("objective/scores", "objective/kl", "eval/gold", "objective/distinct_2")
     curve = [{"episodes": row["step"], **{name: row.get(name) for name in names}} for row in run.metrics]

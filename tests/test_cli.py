@@ -16,8 +16,9 @@ from typing import Any
 
 import pytest
 
-from tightrope import cli, flags, options, panel
+from tightrope import cli
 from tightrope.algorithms.settings import range_text
+from tightrope.cli import flags, options, panel
 from tightrope.control.settings import (
     ALGORITHM_SETTINGS,
     TrainSettings,
@@ -232,7 +233,7 @@ def test_a_flag_that_gathers_may_be_repeated() -> None:
 
 
 def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
-    from tightrope.cli_language import _align_parser
+    from tightrope.cli.language import _align_parser
 
     text = " ".join(_align_parser().format_help().split())
     assert "without its normalisation of rewards" in text
@@ -572,7 +573,7 @@ def test_evaluate_passes_what_is_given_and_prints_the_interval(capsys: pytest.Ca
 def test_help_is_quick_and_needs_no_heavy_package(words: list[str]) -> None:
     heavy = "torch numba gymnasium numpy rich safetensors"
     code = (
-        "import sys\nfrom tightrope.cli import main\ntry:\n    code = main(sys.argv[1:])\n"
+        "import sys\nfrom tightrope.cli.main import main\ntry:\n    code = main(sys.argv[1:])\n"
         "except SystemExit as end:\n    code = end.code\n"
         f"print('heavy:', [m for m in '{heavy}'.split() if m in sys.modules])\nsys.exit(code)"
     )

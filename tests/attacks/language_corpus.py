@@ -203,7 +203,7 @@ def of_supervised() -> list[Attack]:
 
 def cases(place: Path) -> Iterator[tuple[str, str, Path, Attack, Callable[[Path], Any]]]:
     """Group, command, good folder, attack and call for everything there is to play."""
-    from tightrope.cli import main
+    from tightrope.cli.main import main
 
     model, prompts, chats = (str(place / name) for name in ("model", "prompts.jsonl", "chats.jsonl"))
 
@@ -245,7 +245,7 @@ def cases(place: Path) -> Iterator[tuple[str, str, Path, Attack, Callable[[Path]
 
 def prepare(place: Path) -> None:
     """A tiny model, a run of each stage, and data."""
-    from tightrope.cli import main
+    from tightrope.cli.main import main
 
     saved(place / "model", tiny_llama(1), chat=True)
     rows = [{"prompt": text} for text in ("ab", "cd", "efg", "hi")]

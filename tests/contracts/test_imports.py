@@ -49,7 +49,7 @@ def test_imports_point_one_way():
         ("from tightrope.control import agent", "tightrope.maths.values"),
         ("from ..control import agent", "tightrope.maths.values"),
         ("from ..algorithms.ppo import update", "tightrope.runs.run"),
-        ("def f():\n    import tightrope.cli", "tightrope.control.train"),
+        ("def f():\n    import tightrope.cli.main", "tightrope.control.train"),
         ("from tightrope.language import align", "tightrope.control.train"),
         ("import tightrope", "tightrope.algorithms.ppo"),
     ],
@@ -83,8 +83,8 @@ def test_maths_imports_torch_alone():
     "code",
     [
         "import tightrope",
-        "from tightrope.cli import main; main(['--help'])",
-        "from tightrope.cli import main; main(['train', '--help'])",
+        "from tightrope.cli.main import main; main(['--help'])",
+        "from tightrope.cli.main import main; main(['train', '--help'])",
     ],
 )
 def test_start_is_light(code: str):

@@ -9,7 +9,7 @@ from torch import nn
 
 import tightrope
 from tightrope.algorithms import ppo
-from tightrope.control import engines
+from tightrope.control.engine import choose as engines
 
 SMALL = dict(num_envs=4, num_steps=32, minibatch_size=32, num_epochs=2)
 
@@ -295,7 +295,7 @@ def test_kl_penalty_adapts_and_is_saved(tmp_path):
 
 
 def test_reinforce_masks_unfinished_episodes_without_a_baseline():
-    from tightrope.control.collect import finished
+    from tightrope.control.rollout.collector import finished
 
     ended = np.array([[0, 1, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]], bool)
     whole = np.ones_like(ended)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from tightrope.control.autoreset import autoreset_mode
-from tightrope.control.environments import Backend, EnvironmentFault, choose_backend, make_environments
+from tightrope.control.environments.make import Backend, EnvironmentFault, choose_backend, make_environments
+from tightrope.control.environments.vectorised import autoreset_mode
 
 chain.register()
 COUNT = 40

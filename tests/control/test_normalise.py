@@ -8,8 +8,8 @@ from gymnasium.vector import AutoresetMode
 from torch import nn
 
 import tightrope
-from tightrope.control.collect import next_values
-from tightrope.control.normalise import ObservationNormaliser, RewardNormaliser
+from tightrope.control.policy.normalise import ObservationNormaliser, RewardNormaliser
+from tightrope.control.rollout.collector import next_values
 
 
 def test_reward_scale_by_hand_and_restarts_at_both_kinds_of_end():

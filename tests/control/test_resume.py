@@ -14,15 +14,16 @@ import pytest
 import torch
 
 import tightrope
-from tightrope.control import states, train
+from tightrope.control import train
 from tightrope.control.agent import Agent
-from tightrope.control.environments import make_environments
+from tightrope.control.environments import state as states
+from tightrope.control.environments.group import EnvironmentFault
+from tightrope.control.environments.make import make_environments
 from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve
-from tightrope.control.vector import EnvironmentFault
 from tightrope.runs import checkpoint
-from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run
+from tightrope.training.grid import crosses
 
 SMALL = {
     "total_steps": 600, "num_envs": 4, "num_steps": 25, "seed": 3, "minibatch_size": 50, "num_epochs": 2,
@@ -147,10 +148,10 @@ def test_five_hops_end_where_none_does(tmp_path, monkeypatch, kind):
 
 PHASES = {
     "evaluation": (train, "evaluate_agent", 2),
-    "rollout": ("tightrope.control.collect.Environments", "finish", 55),
+    "rollout": ("tightrope.control.rollout.collector.Environments", "finish", 55),
     "advantages": ("tightrope.control.agent", "to_batch", 4),
     "minibatch": ("tightrope.algorithms.ppo", "check_first_ratios", 4),
-    "statistics": ("tightrope.control.normalise.Normalisers", "update", 5),
+    "statistics": ("tightrope.control.policy.normalise.Normalisers", "update", 5),
     "row": (Run, "record", 4),
     "episodes": (Run, "record_episodes", 4),
     "before a save": (train, "save_agent", 2),

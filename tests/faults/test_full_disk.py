@@ -11,17 +11,17 @@ from typing import Any
 import pytest
 from language.tiny import saved
 
-from tightrope.cli import main
+from tightrope.cli.main import main
 from tightrope.control.resolve import resolve
 from tightrope.control.train import resume, train
 from tightrope.language import align
-from tightrope.language.alignment import resume_align
+from tightrope.language.alignment.align import resume_align
 from tightrope.language.settings import AlignSettings, SFTSettings
-from tightrope.language.sft import resume_sft, train_sft
+from tightrope.language.supervised.sft import resume_sft, train_sft
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import CannotWrite
-from tightrope.runs.report import shown
 from tightrope.runs.run import Run
+from tightrope.training.report import shown
 
 SMALL = {"total_steps": 256, "num_envs": 2, "num_steps": 32, "evaluate_every": None, "engine": "torch"}
 FACTS = [{"text": f"{a} is {b}."} for a, b in zip("abcdefgh", "ponmlkji", strict=True)]

@@ -13,10 +13,10 @@ from language.tiny import VOCABULARY, saved, tiny_llama
 
 from tightrope.algorithms.memory import OutOfMemory
 from tightrope.algorithms.nonfinite import NonFiniteError
-from tightrope.language.rewards import RewardError, Rewards
+from tightrope.language.alignment.iteration import Trainer
+from tightrope.language.reward.functions import RewardError, Rewards
 from tightrope.language.settings import AlignSettings
-from tightrope.language.trainer import Trainer
-from tightrope.runs.report import silent
+from tightrope.training.report import silent
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_responses_without_end_and_without_text_train(tmp_path, what, stops, tok
     ],
 )
 def test_a_bad_number_is_named_before_the_step(folder, site, words, bad, monkeypatch):
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     made = trainer(folder)
     if site == "weight":
@@ -127,7 +127,7 @@ def test_a_bad_number_is_named_before_the_step(folder, site, words, bad, monkeyp
 
 
 def test_a_minibatch_that_does_not_fit_is_halved_told_and_remembered(folder, monkeypatch):
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     results = []
     for fits in (100, 3):
@@ -154,7 +154,7 @@ def test_a_minibatch_that_does_not_fit_is_halved_told_and_remembered(folder, mon
 
 
 def test_sampling_that_does_not_fit_ends_with_advice(folder, monkeypatch):
-    from tightrope.language import collect
+    from tightrope.language.alignment import experience as collect
 
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
@@ -165,8 +165,8 @@ def test_sampling_that_does_not_fit_ends_with_advice(folder, monkeypatch):
 
 
 def test_a_rollout_whose_gradients_do_not_fit_goes_on_without_keeping_them(folder, monkeypatch):
-    from tightrope.language import collect
-    from tightrope.language.policy_model import PolicyModel
+    from tightrope.language.alignment import experience as collect
+    from tightrope.language.policy.policy_model import PolicyModel
 
     whole, init, results, kept = collect._look, PolicyModel.__init__, [], []
 
@@ -188,7 +188,7 @@ def test_a_rollout_whose_gradients_do_not_fit_goes_on_without_keeping_them(folde
 
 def test_a_pass_that_failed_for_memory_is_held_by_nothing(folder, monkeypatch):
     """Its graph, that of the rollout's pass, is gone before the minibatch is done again in halves."""
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     made, graphs, alive = trainer(folder, total_episodes=8, kl="exact-split"), [], []
     loss, gather = module.kl_loss, module.gather
@@ -256,7 +256,7 @@ def test_a_faulty_reward_masks_and_counts_and_another_one_stays_what_it_is(kind)
     assert scores.metrics[f"rewards/bad/{counter}"] == count
     assert not [name for name in scores.metrics if name.startswith("rewards/good")]
     assert (~scores.valid).sum() == count and np.isnan(scores.total[~scores.valid]).all()
-    from tightrope.runs.metrics import check_names
+    from tightrope.metrics.table import check_names
 
     check_names(scores.metrics)
     with pytest.raises(RewardError, match="'bad'"):

@@ -99,8 +99,8 @@ def test_a_single_row_that_does_not_fit_ends_with_advice():
 
 def test_supervised_steps_are_halved_likewise():
     from tightrope.algorithms.optimise import Brake
-    from tightrope.language.fitting import Objective, take_step
     from tightrope.language.settings import SFTSettings
+    from tightrope.language.supervised.fit import Objective, take_step
 
     results = []
     for fits in (9, 2):

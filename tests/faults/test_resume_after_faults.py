@@ -11,11 +11,13 @@ from control.test_resume import Walk, assert_same_end, killed, settings_for
 from language.tiny import saved
 
 from tightrope.algorithms.nonfinite import NonFiniteError
-from tightrope.control import copies, train, vector
+from tightrope.control import train
 from tightrope.control.agent import Agent
+from tightrope.control.environments import group as vector
+from tightrope.control.environments import pool as copies
 from tightrope.language import align
-from tightrope.language.alignment import resume_align
-from tightrope.language.trainer import Trainer
+from tightrope.language.alignment.align import resume_align
+from tightrope.language.alignment.iteration import Trainer
 from tightrope.runs.run import Run
 
 

@@ -10,7 +10,7 @@ from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.control.settings import TrainSettings
 from tightrope.control.train import train
 from tightrope.language import align
-from tightrope.runs.rollback import rolling_back
+from tightrope.training.rollback import rolling_back
 
 CONTROL = {
     "num_envs": 2, "num_steps": 32, "minibatch_size": 64, "num_epochs": 1, "hidden": (8,), "total_steps": 640,
@@ -72,7 +72,7 @@ def test_without_a_checkpoint_it_ends_and_says_so(monkeypatch, tmp_path):
 
 
 def test_language_goes_back_goes_on_and_counts(monkeypatch, tmp_path):
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     model, whole, calls, texts = saved(tmp_path / "model"), module.to_batch, [0], []
 

@@ -9,11 +9,11 @@ import torch
 from language.tiny import padded, saved, tiny_gpt2
 
 from tightrope.algorithms import ppo
-from tightrope.cli import main
+from tightrope.cli.main import main
 from tightrope.language import align
-from tightrope.language.alignment import resume_align
+from tightrope.language.alignment.align import resume_align
+from tightrope.language.model.trunk import Trunk
 from tightrope.language.settings import AlignSettings
-from tightrope.language.trunk import Trunk
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
 FAST = {
@@ -289,7 +289,8 @@ def test_the_doctor_finds_nothing_wrong_with_a_healthy_model(folder, capsys):
 
 def test_the_doctor_finds_a_model_that_reads_its_padding(folder, monkeypatch):
     """A trunk that ignores its mask and positions: the gradient depends on padding, sampling on the cache."""
-    from tightrope.language import selfcheck, trunk
+    from tightrope.language import selfcheck
+    from tightrope.language.model import trunk
 
     real = trunk._run
 

@@ -12,11 +12,12 @@ import pytest
 import torch
 from language.tiny import saved, tiny_llama
 
-from tightrope.cli import main
-from tightrope.language import alignment, trainer
-from tightrope.language.alignment import align, resume_align
-from tightrope.language.evaluate import sample_run
-from tightrope.language.trainer import Trainer
+from tightrope.cli.main import main
+from tightrope.language.alignment import align as alignment
+from tightrope.language.alignment import iteration as trainer
+from tightrope.language.alignment.align import align, resume_align
+from tightrope.language.alignment.iteration import Trainer
+from tightrope.language.compare import sample_run
 from tightrope.runs import checkpoint, signals
 from tightrope.runs.lock import RunInUse
 from tightrope.runs.run import Run

@@ -12,9 +12,16 @@ import torch
 from language.test_roles import PROMPTS, fresh, settings, shake
 from language.tiny import saved, tiny_llama
 
-from tightrope.language.collect import comparable, describe, gather, kl_share, rewards_of, to_batch
-from tightrope.language.rewards import Scores
-from tightrope.language.trainer import PolicyModel
+from tightrope.language.alignment.experience import (
+    comparable,
+    describe,
+    gather,
+    kl_share,
+    rewards_of,
+    to_batch,
+)
+from tightrope.language.alignment.iteration import PolicyModel
+from tightrope.language.reward.functions import Scores
 
 EVERY = torch.ones(6, dtype=torch.bool)
 

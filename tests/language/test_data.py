@@ -11,16 +11,9 @@ import pytest
 import torch
 from language.tiny import tokenizer
 
-from tightrope.language.data import (
-    Example,
-    pad_left,
-    pad_right,
-    preference_pairs,
-    read_prompts,
-    read_rows,
-    sft_examples,
-)
-from tightrope.language.packing import PADDING, attention_of, collate, pack, row_of
+from tightrope.language.data.examples import Example, preference_pairs, read_prompts, read_rows, sft_examples
+from tightrope.language.data.packing import PADDING, attention_of, collate, pack, row_of
+from tightrope.language.data.padding import pad_left, pad_right
 
 EOS = 3
 CHATML = (

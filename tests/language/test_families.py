@@ -7,17 +7,19 @@ import torch
 from language.tiny import VOCABULARY, padded, saved
 
 from tightrope.algorithms.optimise import SamplingMismatch
-from tightrope.language import heads, selfcheck
-from tightrope.language.data import Example
-from tightrope.language.faults import refuse_mismatch
-from tightrope.language.ledger import Job, ledger, reward_model_bytes
-from tightrope.language.models import attention_window, load_causal, parts
-from tightrope.language.packing import collate, row_of
-from tightrope.language.reward_model import load_reward
-from tightrope.language.sampling import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample
-from tightrope.language.sft import require_packable, token_loss
-from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.language.trunk import Trunk
+from tightrope.language import selfcheck
+from tightrope.language.alignment.checks import refuse_mismatch
+from tightrope.language.data.examples import Example
+from tightrope.language.data.packing import collate, row_of
+from tightrope.language.generation.distribution import Sampling
+from tightrope.language.generation.sample import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample
+from tightrope.language.generation.token_stats import token_statistics
+from tightrope.language.memory.ledger import Job, ledger, reward_model_bytes
+from tightrope.language.model import logit_factor as heads
+from tightrope.language.model.load import attention_window, load_causal, parts
+from tightrope.language.model.trunk import Trunk
+from tightrope.language.reward.model import load_reward
+from tightrope.language.supervised.sft import require_packable, token_loss
 
 COMMON = {
     "vocab_size": VOCABULARY, "hidden_size": 32, "num_hidden_layers": 4, "num_attention_heads": 2,
@@ -117,7 +119,7 @@ def test_halves_keep_each_layer_s_window(name, cut):
 
 def test_halves_that_mix_up_windows_are_not_used(monkeypatch):
     """The look that a trunk takes at itself sees a wrong window, however wide the real one is."""
-    from tightrope.language import trunk
+    from tightrope.language.model import trunk
 
     real = trunk._halves
 

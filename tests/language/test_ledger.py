@@ -8,10 +8,20 @@ import torch
 from transformers import AutoModelForCausalLM, GPT2Config, LlamaConfig
 
 from tightrope.algorithms.optimise import Adam
-from tightrope.language import lora, shapes
-from tightrope.language.kv_cache import cached_forward
-from tightrope.language.ledger import DoesNotFit, Job, Ledger, amount, available_memory, check, job_of, ledger
-from tightrope.language.models import parts, without_dropout
+from tightrope.language.memory import sizes as shapes
+from tightrope.language.memory.ledger import (
+    DoesNotFit,
+    Job,
+    Ledger,
+    amount,
+    available_memory,
+    check,
+    job_of,
+    ledger,
+)
+from tightrope.language.model import lora
+from tightrope.language.model.kv_cache import cached_forward
+from tightrope.language.model.load import parts, without_dropout
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SFTSettings
 
 LLAMA = LlamaConfig(
@@ -298,7 +308,7 @@ def test_this_machine_says_something() -> None:
 
 def told(settings: AlignSettings, **given) -> tuple[Ledger, str]:
     """The ledger that `make_roles` presents before it loads anything, and its text."""
-    from tightrope.language import roles
+    from tightrope.language.policy import roles
 
     class Stop(Exception):
         pass

@@ -11,16 +11,16 @@ import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
 from tightrope.algorithms.optimise import Brake
-from tightrope.language import lora
-from tightrope.language.data import Pair, pad_left, pad_right, preference_pairs
-from tightrope.language.fitting import Objective, take_step
-from tightrope.language.models import load_causal, parts
-from tightrope.language.reward_model import (
-    RewardModel,
+from tightrope.language.data.examples import Pair, preference_pairs
+from tightrope.language.data.padding import pad_left, pad_right
+from tightrope.language.model import lora
+from tightrope.language.model.load import load_causal, parts
+from tightrope.language.reward.model import SHIFT, RewardModel, last_real, load_reward
+from tightrope.language.settings import RewardSettings
+from tightrope.language.supervised.fit import Objective, take_step
+from tightrope.language.supervised.preferences import (
     calibration,
     differences,
-    last_real,
-    load_reward,
     longest,
     make_head,
     normalise,
@@ -28,8 +28,6 @@ from tightrope.language.reward_model import (
     right_order,
     train_reward,
 )
-from tightrope.language.reward_saving import SHIFT
-from tightrope.language.settings import RewardSettings
 from tightrope.runs.run import Run
 
 EOS = 3
@@ -334,7 +332,7 @@ def test_same_seed_same_bits_other_seed_others(tmp_path, folder):
 
 
 def test_pairs_of_one_prompt_are_held_out_together(tmp_path, folder, monkeypatch):
-    from tightrope.language import reward_model
+    from tightrope.language.supervised import preferences as reward_model
 
     seen = {}
     whole = reward_model.hold_out

@@ -9,12 +9,13 @@ from language.tiny import saved
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.optimise import make_optimiser
-from tightrope.language import lora, policy_model
-from tightrope.language.collect import gather, rewards_of, to_batch
-from tightrope.language.data import Prompt
-from tightrope.language.policy_model import PolicyModel, length_groups, trimmed
-from tightrope.language.rewards import Scores
-from tightrope.language.roles import make_roles
+from tightrope.language.alignment.experience import gather, rewards_of, to_batch
+from tightrope.language.data.examples import Prompt
+from tightrope.language.model import lora
+from tightrope.language.policy import policy_model
+from tightrope.language.policy.policy_model import PolicyModel, length_groups, trimmed
+from tightrope.language.policy.roles import make_roles
+from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings, RLHFSettings
 
 PROMPTS = [Prompt((5, 6, 7), "bcd", {}), Prompt((8, 9), "ef", {}), Prompt((10, 11, 12, 13, 14), "ghijk", {})]
@@ -281,7 +282,7 @@ def test_a_sample_that_does_not_count_is_left_out(folder):
 
 
 def test_a_job_that_cannot_fit_is_refused_before_it_is_loaded(folder, monkeypatch):
-    from tightrope.language import roles as module
+    from tightrope.language.policy import roles as module
 
     monkeypatch.setattr(module, "available_memory", lambda device: 1000)
     monkeypatch.setattr(module, "load_causal", lambda *_: pytest.fail("weights were loaded"))

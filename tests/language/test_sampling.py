@@ -6,10 +6,12 @@ import pytest
 import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama
 
-from tightrope.language.models import load_causal, without_dropout
-from tightrope.language.sampling import draw, positions, sample
-from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.language.trunk import Trunk
+from tightrope.language.data.padding import positions
+from tightrope.language.generation.distribution import Sampling
+from tightrope.language.generation.sample import draw, sample
+from tightrope.language.generation.token_stats import token_statistics
+from tightrope.language.model.load import load_causal, without_dropout
+from tightrope.language.model.trunk import Trunk
 
 MODELS = [tiny_llama, tiny_gpt2]
 EOS = (3,)

@@ -4,8 +4,9 @@ import pytest
 import torch
 from language.tiny import saved
 
-from tightrope.language import selfcheck, trunk
-from tightrope.language.roles import Roles
+from tightrope.language import selfcheck
+from tightrope.language.model import trunk
+from tightrope.language.policy.roles import Roles
 
 
 @pytest.fixture(scope="module")

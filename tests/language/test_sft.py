@@ -13,12 +13,14 @@ from language.test_data import chatml, random_examples
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
 from tightrope.algorithms.optimise import Brake, NonFiniteError
-from tightrope.language import lora
-from tightrope.language.fitting import Objective, hold_out, load, micro_batches, take_step
-from tightrope.language.models import load_causal, load_tokenizer, parts
-from tightrope.language.packing import collate, pack, row_of
+from tightrope.language.data.packing import collate, pack, row_of
+from tightrope.language.data.split import hold_out
+from tightrope.language.model import lora
+from tightrope.language.model.load import load_causal, load_tokenizer, parts
 from tightrope.language.settings import SFTSettings
-from tightrope.language.sft import hidden_states, mean_loss, token_loss, train_sft
+from tightrope.language.supervised.fit import Objective, micro_batches, take_step
+from tightrope.language.supervised.prepare import load
+from tightrope.language.supervised.sft import hidden_states, mean_loss, token_loss, train_sft
 from tightrope.runs.run import Run
 
 MODELS = [tiny_llama, tiny_gpt2]

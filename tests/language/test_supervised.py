@@ -10,16 +10,16 @@ import torch
 from language.test_reward_model import preferences
 from language.tiny import saved, tiny_llama, tokenizer
 
-from tightrope.cli import main
-from tightrope.language import fitting
-from tightrope.language.fitting import minibatches
-from tightrope.language.ledger import DoesNotFit, amount, job_of, ledger
-from tightrope.language.reward_model import resume_reward, train_reward
+from tightrope.cli.main import main
+from tightrope.language.memory.ledger import DoesNotFit, amount, job_of, ledger
 from tightrope.language.settings import RewardSettings, SFTSettings
-from tightrope.language.sft import resume_sft, train_sft
+from tightrope.language.supervised import fit as fitting
+from tightrope.language.supervised.fit import minibatches
+from tightrope.language.supervised.preferences import resume_reward, train_reward
+from tightrope.language.supervised.sft import resume_sft, train_sft
 from tightrope.runs.checkpoint import step_of
-from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run
+from tightrope.training.grid import crosses
 
 FACTS = [f"{a} is {b}." for a, b in zip("abcdefgh", "ponmlkji", strict=True)]
 STAGES = {

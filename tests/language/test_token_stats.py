@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from tightrope.language import token_stats
-from tightrope.language.token_stats import Sampling, shape_logits, token_statistics
+from tightrope.language.generation import token_stats
+from tightrope.language.generation.distribution import Sampling, shape_logits
+from tightrope.language.generation.token_stats import token_statistics
 from tightrope.maths.divergence import categorical_entropy
 
 N, D, V = 11, 6, 17

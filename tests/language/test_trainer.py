@@ -10,18 +10,18 @@ from language.tiny import saved, tiny_llama
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.memory import OutOfMemory
-from tightrope.language import lora
-from tightrope.language.alignment import align
-from tightrope.language.answers import RewardError
-from tightrope.language.collect import gather
-from tightrope.language.data import Prompt
-from tightrope.language.kl import KL_FORMS, AdaptiveKL
-from tightrope.language.policy_model import PolicyModel
-from tightrope.language.ptx import Pretraining
-from tightrope.language.reward_model import train_reward
+from tightrope.language.alignment.align import align
+from tightrope.language.alignment.experience import gather
+from tightrope.language.alignment.iteration import Trainer, hold_out
+from tightrope.language.alignment.kl import KL_FORMS, AdaptiveKL
+from tightrope.language.alignment.ptx import Pretraining
+from tightrope.language.data.examples import Prompt
+from tightrope.language.model import lora
+from tightrope.language.policy.policy_model import PolicyModel
+from tightrope.language.reward.call import RewardError
 from tightrope.language.settings import AlignSettings, RewardSettings
-from tightrope.language.trainer import Trainer, hold_out
-from tightrope.runs.report import silent
+from tightrope.language.supervised.preferences import train_reward
+from tightrope.training.report import silent
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
 
@@ -243,7 +243,7 @@ def test_a_head_on_the_policy_cannot_be_made_of_a_reward_model(folder, tmp_path)
 
 def test_held_out_prompts_are_answered_as_many_at_a_time_as_a_batch_has(folder, monkeypatch):
     """The memory ledger counts on it."""
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     sizes, real = [], module.respond
     monkeypatch.setattr(module, "respond", lambda roles, prompts, *more: (
@@ -301,7 +301,7 @@ def test_memory_that_is_short_for_scoring_names_the_setting(folder, monkeypatch)
 
 def test_memory_that_is_short_for_a_kept_pass_is_told_once(folder, monkeypatch):
     """From then on no pass is kept: the size says so, and lies in the checkpoint."""
-    from tightrope.language import collect
+    from tightrope.language.alignment import experience as collect
 
     lines, looks, whole = [], [], collect._look
 

@@ -41,10 +41,10 @@ from safetensors.torch import save_file
 import tightrope
 from tightrope.control.resolve import resolve
 from tightrope.control.train import train
-from tightrope.language.alignment import align
-from tightrope.language.reward_model import train_reward
+from tightrope.language.alignment.align import align
 from tightrope.language.settings import RewardSettings, SFTSettings
-from tightrope.language.sft import train_sft
+from tightrope.language.supervised.preferences import train_reward
+from tightrope.language.supervised.sft import train_sft
 
 SHORT = {"num_envs": 4, "hidden": (8,), "seed": 3, "threads": 1, "evaluation_episodes": 2}
 CONTROL: dict[str, tuple[Any, str, dict[str, Any], int]] = {  # environment, algorithm, settings, killed at

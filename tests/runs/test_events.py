@@ -11,15 +11,15 @@ import pytest
 from contracts.source_tree import sources
 from language.tiny import saved, tiny_llama
 
-from tightrope import panel
+from tightrope.cli import panel
+from tightrope.cli.language_display import ALIGN, Display
 from tightrope.control.settings import TrainSettings
 from tightrope.control.train import train
-from tightrope.language.alignment import align
-from tightrope.language.display import ALIGN, Display
-from tightrope.language.reward_model import train_reward
+from tightrope.language.alignment.align import align
 from tightrope.language.settings import RewardSettings, SFTSettings
-from tightrope.language.sft import train_sft
-from tightrope.runs import report
+from tightrope.language.supervised.preferences import train_reward
+from tightrope.language.supervised.sft import train_sft
+from tightrope.training import report
 
 Events = list[tuple[str, dict[str, Any]]]
 

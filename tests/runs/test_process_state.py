@@ -24,11 +24,11 @@ from tightrope.control.evaluate import evaluate_run
 from tightrope.control.record import record_run
 from tightrope.control.settings import TrainSettings
 from tightrope.control.train import resume, train
-from tightrope.language.alignment import align, resume_align
-from tightrope.language.evaluate import sample_run
-from tightrope.language.reward_model import resume_reward, train_reward
+from tightrope.language.alignment.align import align, resume_align
+from tightrope.language.compare import sample_run
 from tightrope.language.settings import RewardSettings, SFTSettings
-from tightrope.language.sft import resume_sft, train_sft
+from tightrope.language.supervised.preferences import resume_reward, train_reward
+from tightrope.language.supervised.sft import resume_sft, train_sft
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM, signal.SIGVTALRM, signal.SIGUSR1, signal.SIGUSR2)
 

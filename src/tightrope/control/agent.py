@@ -17,18 +17,18 @@ from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
 from tightrope.algorithms.settings import PPOSettings
-from tightrope.control import engines
-from tightrope.control.collect import Collector, Rollout, to_batch
-from tightrope.control.environments import Environments, available_cores, make_environments
-from tightrope.control.faults import policy_of
-from tightrope.control.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
-from tightrope.control.policies import Policy
+from tightrope.control.engine import choose as engines
+from tightrope.control.engine.cpu_threads import limited_threads
+from tightrope.control.environments.faults import policy_of
+from tightrope.control.environments.make import Environments, available_cores, make_environments
+from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
+from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve
+from tightrope.control.rollout.collector import Collector, Rollout, to_batch
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import ObservationLayout
-from tightrope.control.threads import limited_threads
+from tightrope.control.spaces.observations import ObservationLayout
 from tightrope.maths.values import explained_variance
-from tightrope.runs.grid import crosses
+from tightrope.training.grid import crosses
 
 Array = np.ndarray
 CRUMB = 16  # columns; ten epochs on fewer steps than this would only add noise to a finished policy

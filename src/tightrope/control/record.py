@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from tightrope.control import tasks
+from tightrope.control.environments import tasks
 from tightrope.control.evaluate import EVALUATION_SEED
 
 MAX_FRAMES = 10_000

@@ -46,7 +46,7 @@ def _room(episode: float) -> float:
 
 
 def _time_limit(env: Any) -> int | None:
-    from tightrope.control.tasks import find_spec
+    from tightrope.control.environments.tasks import find_spec
 
     spec = find_spec(env) if isinstance(env, str) else getattr(env, "spec", None)
     return getattr(spec, "max_episode_steps", None)
@@ -62,8 +62,8 @@ def _name_of(env: Any) -> str:
 
 def _describe(env: Any) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
-    from tightrope.control.environments import make_environments
-    from tightrope.control.spaces import action_layout, observation_layout
+    from tightrope.control.environments.make import make_environments
+    from tightrope.control.spaces.observations import action_layout, observation_layout
 
     vector = hasattr(env, "single_observation_space")
     if vector or hasattr(env, "observation_space"):

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from tightrope.algorithms.peer_names import PEER_NAMES
 from tightrope.algorithms.settings import (
     A2CSettings,
     PPOSettings,
@@ -19,6 +18,7 @@ from tightrope.algorithms.settings import (
     check_ranges,
     setting,
 )
+from tightrope.settings.peer_names import PEER_NAMES
 
 Algorithm = Literal["ppo", "a2c", "reinforce"]
 ALGORITHM_SETTINGS: dict[str, type[UpdateSettings]] = {

@@ -24,11 +24,11 @@ from tightrope.control.settings import TrainSettings, settings_from_json, settin
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
-from tightrope.runs.grid import crosses
 from tightrope.runs.history import steps_in
-from tightrope.runs.report import Reporter, say, silent, teller, warn
-from tightrope.runs.rollback import rolling_back
 from tightrope.runs.run import Run
+from tightrope.training.grid import crosses
+from tightrope.training.report import Reporter, say, silent, teller, warn
+from tightrope.training.rollback import rolling_back
 
 __all__ = ["resolve", "resume", "train"]
 

@@ -11,16 +11,18 @@ from torch import Tensor
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser
-from tightrope.language.collect import Experience, gather, rewards_of, to_batch
-from tightrope.language.data import Prompt, pad_left, pad_right
-from tightrope.language.policy_model import PolicyModel
+from tightrope.findings import Finding
+from tightrope.language.alignment.experience import Experience, gather, rewards_of, to_batch
+from tightrope.language.data.examples import Prompt
+from tightrope.language.data.padding import pad_left, pad_right
+from tightrope.language.generation.distribution import Sampling
+from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.generation.token_stats import token_statistics
+from tightrope.language.policy.policy_model import PolicyModel
+from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.quiet import quiet
-from tightrope.language.rewards import Scores
-from tightrope.language.roles import Roles, make_roles
-from tightrope.language.sampling import log_ratio_limit
+from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings, RLHFSettings
-from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.runs.findings import Finding
 
 WORDS = ("The", "Once upon a time there was", "I think that", "a b c d e f g h")
 GRADIENT_LIMIT = 1e-3  # relative, of the norm: float32 sums in another order
@@ -226,7 +228,7 @@ def _returns(experience: Experience, rewards: Tensor, batch: Batch) -> Finding:
 
 
 def _trunk(roles: Roles) -> Finding:
-    from tightrope.language.trunk import Trunk
+    from tightrope.language.model.trunk import Trunk
 
     layers = len(roles.trunk.parts.layers)
     cut = Trunk(roles.model, layers // 2).cut if layers > 1 else 1

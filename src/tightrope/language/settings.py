@@ -6,8 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Self
 
-from tightrope.algorithms.peer_names import PEER_NAMES
 from tightrope.algorithms.settings import PPOSettings, Schedule, check_ranges, setting
+from tightrope.settings.peer_names import PEER_NAMES
 
 Tune = Literal["lora", "full"]
 # kl_adapt and the KL-penalised surrogate are the control story's; here kl_beta weighs the KL to the reference

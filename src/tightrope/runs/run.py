@@ -10,7 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from tightrope.runs import checkpoint, durable, history, metrics, signals, versions
+from tightrope.metrics import table as metrics
+from tightrope.runs import checkpoint, durable, history, signals, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import CannotWrite, sync_folder, writing
 from tightrope.runs.folders import fresh, require_free, why_not

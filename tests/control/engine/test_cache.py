@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 import tightrope
-from tightrope.control.engine import cache, compiled
-from tightrope.control.engine.threads import Pace
+from tightrope.control.engine.compiled import cache
+from tightrope.control.engine.compiled import numba_tools as compiled
+from tightrope.control.engine.compiled.threads import Pace
 
 COMPILER = ("numba.np.linalg", "numba.np.arrayobj", "numba.np.random.generator_core", "numba.cpython.unicode")
 SOURCES = (str(Path(tightrope.__file__).parents[1]), str(Path(__file__).parent))
@@ -29,7 +30,8 @@ def memory():
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 before = memory()
-from tightrope.control.engine import FusedEngine, infer
+from tightrope.control.engine import FusedEngine
+from tightrope.control.engine.compiled import infer
 needed = memory() - before
 import engine_cases
 x = np.arange(12, dtype=np.float32).reshape(3, 4)
@@ -59,7 +61,7 @@ def start(caches):
 @pytest.fixture
 def warm(tmp_path):
     """A cache directory with a copy of all that is compiled."""
-    from tightrope.control.engine import fused  # noqa: F401  (compiles what is not there yet)
+    from tightrope.control.engine.compiled import fused  # noqa: F401  (compiles what is not there yet)
 
     folder = compiled.cache_folder()
     if folder is None or compiled.compilation_due():
@@ -95,14 +97,16 @@ def test_numbas_own_setting_is_left_alone():
 
 def test_a_warm_start_needs_no_compiler_and_little_memory(warm):
     _, memory, modules = start(warm.parents[2])
-    assert "tightrope.control.engine.update" in modules
+    assert "tightrope.control.engine.compiled.update" in modules
     assert not [name for name in (*COMPILER, "scipy.linalg") if name in modules]
     assert memory < 130  # MB; about 80, and 50 more with all that numba needs for a compilation
 
 
 def test_damaged_and_foreign_entries_are_compiled_again_to_the_same_bits(warm):
     expected, _, _ = start(warm.parents[2])
-    entry, other = (warm / f"tightrope.control.engine.{name}" for name in ("infer.gae", "update.train"))
+    entry, other = (
+        warm / f"tightrope.control.engine.compiled.{name}" for name in ("infer.gae", "update.train")
+    )
     sound, data = entry.read_bytes(), bytearray(entry.read_bytes())
     data[len(data) // 2] ^= 1
     entry.write_bytes(data)
@@ -143,7 +147,8 @@ def test_folders_long_out_of_use_are_removed(tmp_path, monkeypatch):
 
 def test_scipys_linear_algebra_is_whole_after_its_blas_was_taken_alone():
     code = (
-        "import tightrope.control.engine.compiled, scipy.linalg, scipy.linalg.cython_blas as b, numpy\n"
+        "import tightrope.control.engine.compiled.numba_tools\n"
+        "import scipy.linalg, scipy.linalg.cython_blas as b, numpy\n"
         "from scipy.linalg import cython_blas as c\n"
         "from numba.extending import get_cython_function_address as address\n"
         "assert b is c and address('scipy.linalg.cython_blas', 'dgemm')\n"
@@ -155,7 +160,7 @@ def test_scipys_linear_algebra_is_whole_after_its_blas_was_taken_alone():
 
 
 def test_wrong_arguments_are_refused():
-    from tightrope.control.engine import infer
+    from tightrope.control.engine.compiled import infer
 
     with pytest.raises(TypeError, match="No matching definition"):
         infer.values(np.zeros(3), 1, 2, 3, 4, 5)

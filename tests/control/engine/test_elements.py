@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from tightrope.control.engine import dense
+from tightrope.control.engine.compiled import dense
 
 
 def run(function, x):

@@ -9,7 +9,7 @@ import torch
 from engine_cases import difference, make, make_batch, numbers
 
 from tightrope.algorithms.optimise import NonFiniteError, SamplingMismatch
-from tightrope.control.engine import FusedEngine
+from tightrope.control.engine.compiled import FusedEngine
 
 
 def refuse(policy, optimiser, settings, batch, threads):
@@ -121,7 +121,7 @@ def test_what_is_sampled_is_what_is_trained():
 
 
 def test_compiled_code_sees_nan_and_infinity():
-    from tightrope.control.engine.update import not_finite
+    from tightrope.control.engine.compiled.update import not_finite
 
     look = numba.njit(lambda x: not_finite(x))
     good = np.linspace(-3e38, 3e38, 1000).astype(np.float32)

@@ -1,0 +1,159 @@
+"""The third stage: PPO on a causal language model, as one function.
+
+from tightrope.language import align
+run = align(model="path/to/model", prompts=prompts, reward=reward, total_episodes=4096, seed=1)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from pathlib import Path
+from typing import Any
+
+from tightrope.language.alignment.iteration import Aligned, Trainer
+from tightrope.language.alignment.kl import bias_of
+from tightrope.language.alignment.state import restore_state
+from tightrope.language.quiet import quiet
+from tightrope.language.settings import NOT_HERE, AlignSettings
+from tightrope.language.supervised.prepare import threads
+from tightrope.runs.history import steps_in
+from tightrope.runs.records import retyped
+from tightrope.runs.run import Run
+from tightrope.training.report import Reporter, say, silent, teller, warn
+
+__all__ = ["Aligned", "align", "resume_align"]
+
+
+@quiet()
+def align(
+    settings: AlignSettings | None = None,
+    *,
+    prompts: Any = None,
+    reward: Any = None,
+    gold: Any = None,
+    run_dir: str | Path | None = None,
+    report: Reporter = silent,
+    **values: Any,
+) -> Aligned:
+    """Train a language model against a reward; returns the run.
+
+    ``prompts``: texts, message lists or rows with a "prompt", or a file of them. ``reward``: a function as
+    TRL calls it, (function, weight), "length", FILE.py:function, the folder of a reward model, or a list of
+    these. ``gold``: another judge of the same kinds, asked on held-out prompts and never trained on.
+    Everything else is a field of AlignSettings or RLHFSettings. Raises ValueError for what cannot work,
+    before anything is trained.
+    """
+    settings = (settings or AlignSettings()).with_values(**_named(prompts, reward, gold), **values)
+    for risk in settings.risks():
+        warn(report, risk)
+    if (bias := bias_of(settings.kl)) is not None:
+        warn(report, f"{bias}.")
+    sources = (
+        settings.data if prompts is None else prompts,
+        settings.reward if reward is None else reward,
+        settings.gold if gold is None else gold,
+    )
+    with threads(settings.threads):
+        trainer = Trainer(settings, *sources, report)
+        name = f"align-{Path(settings.model).name}-{settings.seed}"
+        return trainer.run(Run.create(run_dir, dataclasses.asdict(trainer.settings), name))
+
+
+def _named(prompts: Any, reward: Any, gold: Any) -> dict[str, str]:
+    """What settings.json says of objects that were given in Python: their names in angle brackets, for
+    display alone, so that none is taken for a file, a folder or a reward that this package knows.
+    """
+    found = {}
+    for name, value in (("data", prompts), ("reward", reward), ("gold", gold)):
+        if value is not None:
+            found[name] = (
+                str(value)
+                if isinstance(value, str | Path)
+                else f"<{getattr(value, '__name__', type(value).__name__).strip('<>')}>"
+            )
+    return found
+
+
+@quiet()
+def resume_align(
+    run_dir: str | Path,
+    *,
+    prompts: Any = None,
+    reward: Any = None,
+    gold: Any = None,
+    total_episodes: int | None = None,
+    report: Reporter = silent,
+) -> Aligned:
+    """Go on from a run's newest checkpoint, or from the start where there is none yet; the end is that of a
+    run without a break, bit for bit.
+
+    Code is never named by a file: a reward that was a function must be given again, and prompts that were no
+    file too. ``total_episodes`` extends a finished run.
+    """
+    with Run.open(run_dir, own=True) as run:
+        settings = settings_from_json(run.settings)
+        if total_episodes is not None:
+            settings = settings.with_values(total_episodes=total_episodes)
+        _require_what_no_file_gives(run_dir, settings, prompts, reward, gold)
+        sources = (
+            settings.data if prompts is None else prompts,
+            settings.reward if reward is None else reward,
+            settings.gold if gold is None else gold,
+        )
+        with threads(settings.threads):
+            trainer = Trainer(settings, *sources, report)
+            _go_back(trainer, run, total_episodes)
+            return trainer.run(run)
+
+
+def _require_what_no_file_gives(
+    run_dir: str | Path, settings: AlignSettings, prompts: Any, reward: Any, gold: Any
+) -> None:
+    """ValueError for prompts and judges that were objects and are not given again."""
+    for name, value in (("reward", reward), ("gold", gold)):
+        known = getattr(settings, name)
+        if value is None and known not in (None, "length") and not Path(known).is_dir():
+            raise ValueError(
+                f"The {name} of {run_dir} was {known!r}: code, which no file may import, or a folder that is "
+                "not there any more. If it is yours, or you have read it, name it again: tightrope resume "
+                f"{shlex.quote(str(run_dir))} --{name} {retyped(known, 'FILE.py:function')}"
+            )
+    if prompts is None and not Path(settings.data).is_file():
+        raise ValueError(
+            f"The prompts of {run_dir} were {settings.data!r}, which is no file. Give them again: "
+            f"tightrope resume {shlex.quote(str(run_dir))} --data PROMPTS.jsonl"
+        )
+
+
+def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
+    """Put trainer and run to the newest checkpoint, or to the start where there is none."""
+    settings, report = trainer.settings, trainer.report
+    point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
+    if point is not None:
+        restore_state(trainer, point)
+    if total_episodes is not None and total_episodes < trainer.episodes:
+        raise ValueError(
+            f"{run.path} has had {trainer.episodes:,} responses already; expected total_episodes of as "
+            f"many or more, got {total_episodes:,}."
+        )
+    if point is not None and trainer.episodes >= settings.total_episodes:
+        text = f"{run.path} has its {trainer.episodes:,} responses; --total-episodes N goes on from there."
+        say(report, text)
+    trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
+    run.rewind(point)
+    run.update_settings(dataclasses.asdict(settings))
+
+
+def settings_from_json(data: dict[str, Any]) -> AlignSettings:
+    """The settings of an alignment run's settings.json. ValueError for another command's, or unknown
+    names.
+    """
+    inner = data.get("update")
+    if not isinstance(inner, dict) or "max_new_tokens" not in data:
+        raise ValueError("These are not the settings of an alignment run.")
+    outer = {name: value for name, value in data.items() if name != "update"}
+    own = {name: value for name, value in inner.items() if name not in NOT_HERE}
+    if twice := sorted(set(outer) & set(own)):
+        raise ValueError(f"The settings name {', '.join(twice)} twice, outside and inside update.")
+    return AlignSettings().with_values(**outer, **own)
