@@ -20,8 +20,8 @@ DECLARED_IN = {
         "algorithms/settings.py",
         "control/settings.py",
         "control/presets.py",
-        "options.py",
-        "flags.py",
+        "cli/options.py",
+        "cli/flags.py",
     )
 }
 
