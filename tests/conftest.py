@@ -1,6 +1,11 @@
 """A test may be skipped only for a reason listed here; any other skip fails the run."""
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# how fast a machine is, and how busy, is no property of the code
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 ALLOWED = (
     "could not import 'envpool'",  # 800 MB that CI does not install; its adapter is also tested by a stand-in

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import email
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -30,6 +31,7 @@ SOURCES = ("src", "setup.py", "pyproject.toml", "README.md", "LICENSE")
 def run(command: list[str | Path], where: Path) -> str:
     """What a command prints, run with none of this environment's settings. It must exit with 0."""
     clean = {"PATH": "/usr/bin:/bin", "HOME": str(where), "PYTHONDONTWRITEBYTECODE": "1"}
+    clean["PIP_CONFIG_FILE"] = os.devnull  # a constraint of the machine must not decide
     ended = subprocess.run(command, cwd=where, env=clean, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, f"{command}\n{ended.stdout}\n{ended.stderr}"
     return ended.stdout

@@ -29,6 +29,7 @@ from unittest import mock
 MARK = "attackmark"
 TEMPLATE = "<template>"  # of a chat, in jinja2's sandbox
 PROGRAMS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "socket.connect", "ctypes.dlopen")
+LIBRARIES = "['/sbin/ldconfig', '-p']"  # ctypes.util.find_library, of packages that look for the C library
 CACHE = str(Path("tightrope", "control", "engine", "cache.py"))  # numba's compile cache: an exception
 SPAWN, BEGUN = str(Path("multiprocessing", "spawn.py")), str(Path("multiprocessing", "process.py"))
 TESTS = Path(__file__).parents[1]
@@ -109,6 +110,7 @@ class Watch:
             return f"{name}" if MARK in text and not allowed else ""
         if event in PROGRAMS:
             harmless = event == "ctypes.dlopen" and self.place not in str(arguments)
+            harmless |= len(arguments) > 1 and str(arguments[1]) == LIBRARIES
             return "" if harmless else str(arguments)[:200]
         return ""
 

@@ -63,7 +63,8 @@ def fit(points: Sequence[tuple[float, float]]) -> Fit:
     KL in nats, per response. An estimate of it may be below 0 and counts as 0. Pairs that are not finite are
     left out. The offset, gold's score at the reference, is fitted like the rest.
     """
-    pairs = [(max(kl, 0.0), gold) for kl, gold in points if math.isfinite(kl) and math.isfinite(gold)]
+    # sorted: sums round by their order, and the order of the points must not decide what is too much alike
+    pairs = sorted((max(kl, 0.0), gold) for kl, gold in points if math.isfinite(kl) and math.isfinite(gold))
     kl, gold = np.array(pairs, float).reshape(-1, 2).T
     d = np.sqrt(kl)
     reason = _too_little(d)
