@@ -52,8 +52,8 @@ SCIPY = "loads scipy's own BLAS extension from where scipy is installed"
 EXCEPTIONS = {
     ("control/workers.py", "CloudpickleWrapper"): TRANSPORT,
     ("control/workers.py", "multiprocessing"): TRANSPORT,
-    ("control/engine/cache.py", "pickle"): CACHE,
-    ("control/engine/compiled.py", "exec_module"): SCIPY,
+    ("control/engine/compiled/cache.py", "pickle"): CACHE,
+    ("control/engine/compiled/primitives.py", "exec_module"): SCIPY,
     ("cli.py", "import_module"): NAMED_BY_THE_USER,
     ("cli.py", "exec_module"): NAMED_BY_THE_USER,
     ("cli.py", "spec_from_file_location"): NAMED_BY_THE_USER,
