@@ -35,7 +35,7 @@ needed = memory() - before
 import engine_cases
 x = np.arange(12, dtype=np.float32).reshape(3, 4)
 no, yes, out = np.zeros(x.shape, bool), np.ones(x.shape, bool), np.empty_like(x)
-infer.gae(x, x + 1, x + 2, no, no, yes, 0.99, 0.95, out)
+infer.gae_batch(x, x + 1, x + 2, no, no, yes, 0.99, 0.95, out)
 policy, optimiser, settings = engine_cases.make()
 batch, rng = engine_cases.make_batch(policy), np.random.default_rng(0)
 metrics = FusedEngine(policy, optimiser, 1).update(policy, optimiser, batch, settings, rng)
@@ -98,13 +98,14 @@ def test_a_warm_start_needs_no_compiler_and_little_memory(warm):
     _, memory, modules = start(warm.parents[2])
     assert "tightrope.control.engine.compiled.update" in modules
     assert not [name for name in (*COMPILER, "scipy.linalg") if name in modules]
-    assert memory < 130  # MB; about 80, and 50 more with all that numba needs for a compilation
+    assert memory < 130  # MB; about 90, and 40 more with all that numba needs for a compilation
 
 
 def test_damaged_and_foreign_entries_are_compiled_again_to_the_same_bits(warm):
     expected, _, _ = start(warm.parents[2])
     entry, other = (
-        warm / f"tightrope.control.engine.compiled.{name}" for name in ("infer.gae", "update.train")
+        warm / f"tightrope.control.engine.compiled.{name}"
+        for name in ("infer.gae_batch", "update.run_epochs")
     )
     sound, data = entry.read_bytes(), bytearray(entry.read_bytes())
     data[len(data) // 2] ^= 1
@@ -162,7 +163,7 @@ def test_wrong_arguments_are_refused():
     from tightrope.control.engine.compiled import infer
 
     with pytest.raises(TypeError, match="No matching definition"):
-        infer.values(np.zeros(3), 1, 2, 3, 4, 5)
+        infer.value_batch(np.zeros(3), 1, 2, 3, 4, 5)
 
 
 def test_choice_takes_the_quicker_way_and_tries_the_other_again():

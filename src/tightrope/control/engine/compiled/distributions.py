@@ -64,7 +64,7 @@ def categorical(places, component, work, n):
     normalise_logits(places, work, first, count, n)
     top, total = row(work, vectors + plan.TOP, n), row(work, vectors + plan.SUM, n)
     own = row(work, vectors + plan.CHOSEN, n)
-    h = row(work, places[plan.ENTROPIES] + component[plan.ENTROPY] * n, n)
+    h = row(work, places[plan.ENTROPIES] + component[plan.ENTROPY_ROW] * n, n)
     chosen = row(work, places[plan.ACTIONS] + component[plan.COLUMN] * n, n)
     for i in range(n):
         own[i] = f(np.nan)  # an action that is no category has no probability
@@ -155,7 +155,7 @@ def gradient_of_outputs(places, components, flat, grad, work, n, entropy_share):
     for j in range(len(components)):
         kind = components[j, plan.KIND]
         column = 0 if kind == plan.CATEGORICAL else 1
-        h = row(work, places[plan.ENTROPIES] + components[j, plan.ENTROPY] * n, n)
+        h = row(work, places[plan.ENTROPIES] + components[j, plan.ENTROPY_ROW] * n, n)
         for k in range(components[j, plan.COUNT]):
             at = (components[j, plan.PARAMETER] + k) * n
             z, s = row(work, places[plan.LOGITS] + at, n), row(work, places[plan.LOGS] + at, n)

@@ -1,5 +1,4 @@
-"""The engine as Python sees it: torch's parameters and Adam moved into flat memory, and calls of compiled
-code."""
+"""The engine as Python sees it: torch's parameters and Adam in flat memory, and calls of compiled code."""
 
 from __future__ import annotations
 
@@ -14,10 +13,10 @@ import torch
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
-from tightrope.algorithms.nonfinite import NonFiniteError
-from tightrope.algorithms.optimise import SamplingMismatch
+from tightrope.algorithms.nonfinite import NonFiniteError, explain
+from tightrope.algorithms.optimise import check_first_ratios
 from tightrope.algorithms.settings import PPOSettings
-from tightrope.control.engine.compiled import cache, diagnose, infer, plan, threads
+from tightrope.control.engine.compiled import cache, infer, plan, threads
 from tightrope.control.engine.compiled import update as kernels
 
 cache.mark_complete()  # importing infer and update has compiled or loaded every entry
@@ -111,7 +110,7 @@ class FusedEngine:
         """
         p, masks = self._plan, _NO_MASK if action_mask is None else action_mask
         mean, inverse_std = (_NOTHING, _NOTHING) if mean is None else (mean, inverse_std)
-        infer.act(
+        infer.act_batch(
             p.places, p.layers, p.components, self._flat, self._work[0], flat, mean, inverse_std, clip, masks,
             noise, actions_out, logp_out, inputs_out,
         )  # fmt: skip
@@ -119,7 +118,7 @@ class FusedEngine:
     def values(self, flat: Array) -> Array:
         """Values [N] float32 of inputs [N, D], already normalised."""
         out = np.empty(len(flat), np.float32)
-        infer.values(self._plan.places, self._plan.layers, self._flat, self._work[0], _float(flat), out)
+        infer.value_batch(self._plan.places, self._plan.layers, self._flat, self._work[0], _float(flat), out)
         return out
 
     def gae(
@@ -141,7 +140,7 @@ class FusedEngine:
             raise ValueError(
                 f"All arrays of gae must have one shape; got {[x.shape for x in (*numbers, *flags)]}."
             )
-        infer.gae(*numbers, *flags, gamma, gae_lambda, out)
+        infer.gae_batch(*numbers, *flags, gamma, gae_lambda, out)
         return out
 
     # --- learning
@@ -175,15 +174,25 @@ class FusedEngine:
         self._choice.record(together, time.perf_counter() - began, int(run.ledgers[0, kernels.NORM_COUNT]))
         self._steps += np.float32(run.ledgers[0, kernels.STEPS])
         if status == kernels.NOT_FINITE:
-            at = int(run.ledgers[0, kernels.AT])
-            number = at // settings.minibatch_size
-            there = run.order[at : at + settings.minibatch_size]
-            raise NonFiniteError(
-                diagnose.describe(self, columns, there, run.epoch, number, batch.mask.shape[1])
-            )
+            raise NonFiniteError(self._explain(run, batch, settings))
         if status == kernels.MISMATCH:
-            raise SamplingMismatch(diagnose.mismatch(run.ledgers[0, kernels.FIRST], log_ratio_limit))
+            check_first_ratios(torch.tensor(run.ledgers[0, kernels.FIRST]), log_ratio_limit)
         return run.metrics()
+
+    def _explain(self, run: _Run, batch: Batch, settings: PPOSettings) -> str:
+        """The message of the minibatch that was refused, as ppo.update gives it."""
+        k, (actor, critic), size = kernels, run.ledgers[:2], settings.minibatch_size
+        start = int(actor[k.AT])
+        where = f"in minibatch {start // size + 1} of epoch {run.epoch + 1}"
+        rows = torch.from_numpy(run.order[start : start + size])
+        minibatch = batch.map(lambda x: x.flatten(0, 1).unsqueeze(1)).select(rows)
+        sums = torch.tensor([actor[k.KL_NOW], actor[k.POLICY] + critic[k.VALUES]], dtype=torch.float64)
+        for parameter, at in self._plan.parameters:
+            part = torch.from_numpy(self._grad[at : at + parameter.numel()])
+            parameter.grad = part.view(parameter.shape)
+        message = explain(self.policy, self.optimiser, batch, minibatch, where, sums)
+        self.optimiser.zero_grad()  # torch shall not see the flat memory of the gradients
+        return message
 
     def _options(self, settings: PPOSettings, limit: float | None) -> Array:
         """Numbers for the compiled code; learning rates, betas and epsilon are those of the optimiser."""
@@ -199,7 +208,7 @@ class FusedEngine:
             options[k.ACTOR_FROM + 2 * half], options[k.ACTOR_TO + 2 * half] = begin, end
         first = self.optimiser.param_groups[0]
         (options[k.BETA_1], options[k.BETA_2]), options[k.EPSILON] = first["betas"], first["eps"]
-        options[k.CLIP] = settings.clip
+        options[k.CLIP_LOW] = settings.clip
         options[k.CLIP_HIGH] = settings.clip if settings.clip_high is None else settings.clip_high
         options[k.VALUE_CLIP] = settings.value_clip or 0.0
         options[k.VALUE_WEIGHT], options[k.ENTROPY_WEIGHT] = settings.value_weight, settings.entropy_weight
@@ -242,13 +251,13 @@ class _Run:
         self.engine, self.columns, self.options = engine, columns, options
         self.control = np.zeros(threads.CONTROL_SIZE, np.int64)
         self.exchange, self.ledgers = np.zeros(4 * kernels.LEDGER), np.zeros((4, kernels.LEDGER))
-        self.ledgers[0, [kernels.SMALLEST, kernels.LARGEST]] = np.inf, -np.inf
+        self.ledgers[0, [kernels.RATIO_MIN, kernels.RATIO_MAX]] = np.inf, -np.inf
         self.epoch, self.order = 0, np.zeros(0, np.int64)
 
     def _call(self, role: int, begin: int, epoch: int, epochs: int) -> int:
         e, p = self.engine, self.engine._plan
         work = e._work[1 if role == kernels.CRITIC else 0]
-        return kernels.train(
+        return kernels.run_epochs(
             role, begin, epoch, epochs, p.places, p.layers, p.components,
             e._flat, e._grad, e._moment, e._square, work,
             *self.columns, self.order, self.options, self.control, self.exchange, self.ledgers,
@@ -292,14 +301,14 @@ class _Run:
         means = {
             "policy_gradient_loss": actor[k.POLICY] / rows,
             "value_loss": critic[k.VALUES] / critic[k.ROWS_SEEN],
-            "entropy": actor[k.ENTROPY] / rows,
+            "entropy": actor[k.ENTROPY_SUM] / rows,
             "approx_kl": actor[k.KL] / rows,
             "clip_fraction": (actor[k.HIGH] + actor[k.LOW]) / rows,
             "clip_fraction_high": actor[k.HIGH] / rows,
             "clip_fraction_low": actor[k.LOW] / rows,
             "grad_norm": actor[k.NORMS] / actor[k.NORM_COUNT],
-            "ratio_min": actor[k.SMALLEST],
-            "ratio_max": actor[k.LARGEST],
+            "ratio_min": actor[k.RATIO_MIN],
+            "ratio_max": actor[k.RATIO_MAX],
             "log_ratio_first": actor[k.FIRST],
             "minibatches": actor[k.STEPS],
         }

@@ -15,7 +15,7 @@ from tightrope.control.engine.compiled.primitives import ZERO, f, row, runtime
     "void(int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1], float32[:,:], float32[::1],"
     "float32[::1], float64, boolean[:,:], float32[:,:], float32[:,:], float32[:], float32[:,:])"
 )
-def act(
+def act_batch(
     places, layers, components, flat, work, raw, mean, inverse, clip, masks, noise, actions, logp, inputs
 ):  # fmt: skip
     """Normalise, run the actor, sample; write actions, log-probabilities and normalised inputs.
@@ -25,8 +25,8 @@ def act(
     W] (no rows: none); noise [B, A]; outputs: actions [B, A], logp [B] and inputs [B, D].
     """
     normalise, limit, masked = len(mean) > 0, f(clip), masks.shape[0] > 0
-    for begin in range(0, len(raw), plan.BLOCK):
-        n = plan.BLOCK if len(raw) - begin > plan.BLOCK else len(raw) - begin
+    for begin in range(0, len(raw), plan.BLOCK_ROWS):
+        n = plan.BLOCK_ROWS if len(raw) - begin > plan.BLOCK_ROWS else len(raw) - begin
         for i in range(n):
             for d in range(places[plan.FEATURES]):
                 x = raw[begin + i, d]
@@ -37,7 +37,7 @@ def act(
                 inputs[begin + i, d] = x
                 work[d * n + i] = x
             if masked:
-                for k in range(places[plan.WIDTH]):
+                for k in range(places[plan.MASK_WIDTH]):
                     work[places[plan.PENALTY] + k * n + i] = ZERO if masks[begin + i, k] else f(-np.inf)
         forward(flat, layers, runtime(0), places[plan.TRUNK_LAST], work, n)
         forward(flat, layers, places[plan.ACTOR_FIRST], places[plan.ACTOR_LAST], work, n)
@@ -51,10 +51,10 @@ def act(
 
 
 @entry("void(int64[::1], int64[:,::1], float32[::1], float32[::1], float32[:,:], float32[::1])")
-def values(places, layers, flat, work, inputs, out):
+def value_batch(places, layers, flat, work, inputs, out):
     """The critic's value of every row of ``inputs``, already normalised."""
-    for begin in range(0, len(inputs), plan.BLOCK):
-        n = plan.BLOCK if len(inputs) - begin > plan.BLOCK else len(inputs) - begin
+    for begin in range(0, len(inputs), plan.BLOCK_ROWS):
+        n = plan.BLOCK_ROWS if len(inputs) - begin > plan.BLOCK_ROWS else len(inputs) - begin
         for i in range(n):
             for d in range(places[plan.FEATURES]):
                 work[d * n + i] = inputs[begin + i, d]
@@ -69,7 +69,7 @@ def values(places, layers, flat, work, inputs, out):
     "void(float32[:,::1], float32[:,::1], float32[:,::1], boolean[:,::1], boolean[:,::1], boolean[:,::1],"
     "float64, float64, float32[:,::1])"
 )
-def gae(rewards, values, next_values, terminated, ended, mask, gamma, gae_lambda, out):
+def gae_batch(rewards, values, next_values, terminated, ended, mask, gamma, gae_lambda, out):
     """A_t = r_t + gamma V_{t+1} - V_t + gamma lambda A_{t+1}, cut as in maths.returns.gae.
 
     Numbers behind a cut may be anything: they are not used.

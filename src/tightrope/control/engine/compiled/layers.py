@@ -1,5 +1,4 @@
-"""Layers: forward and backward over one flat buffer of parameters; widths and depths are known only at run
-time.
+"""Layers: forward and backward over one flat buffer of parameters, for widths and depths known at run time.
 
 Everything is feature-major, [features, rows], so that rows fill the vector lanes: a layer is Z = W X + b
 with W as torch keeps it, [outputs, inputs]. ``work`` holds all intermediate matrices, each [features, n] for
@@ -21,7 +20,7 @@ from tightrope.control.engine.compiled.primitives import (
     tanh,
 )  # fmt: skip  # isort: skip
 
-NARROW = 8  # BLAS does not pay for layers with at most so many inputs or outputs
+NARROW_LAYER = 8  # BLAS does not pay for layers with at most so many inputs or outputs
 
 
 @kernel
@@ -118,7 +117,7 @@ def forward(flat, layers, first, last, work, n):
         feed, at = layers[layer, plan.FEED], layers[layer, plan.VALUE]
         source = layers[feed, plan.VALUE] if feed >= 0 else 0
         weight = layers[layer, plan.WEIGHT]
-        if inputs > NARROW and outputs > NARROW:
+        if inputs > NARROW_LAYER and outputs > NARROW_LAYER:
             gemm(
                 False,
                 False,
@@ -170,7 +169,7 @@ def backward(flat, grad, layers, first, last, work, n, more, join):
         inputs, outputs = layers[layer, plan.INPUTS], layers[layer, plan.OUTPUTS]
         feed, delta = layers[layer, plan.FEED], layers[layer, plan.DELTA]
         source = layers[feed, plan.VALUE] if feed >= 0 else 0
-        weight, wide = layers[layer, plan.WEIGHT], inputs > NARROW and outputs > NARROW
+        weight, wide = layers[layer, plan.WEIGHT], inputs > NARROW_LAYER and outputs > NARROW_LAYER
         bias = row(grad, layers[layer, plan.BIAS], outputs)
         for j in range(outputs):
             g, s = row(work, delta + j * n, n), ZERO

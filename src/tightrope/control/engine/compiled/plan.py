@@ -1,5 +1,4 @@
-"""Which policies the engine supports, and how it lays one out: flat buffers and the tables that describe
-them.
+"""Which policies the engine supports, and how it lays one out in flat buffers described by tables.
 
 The kernels know depths, widths and action spaces only from these tables. Nothing here needs numba.
 """
@@ -17,7 +16,7 @@ from torch import nn
 
 from tightrope.algorithms.settings import PPOSettings, UpdateSettings
 
-BLOCK = 128  # rows worked on at once: sums are made block by block, so this number is part of the bits
+BLOCK_ROWS = 128  # rows worked on at once: sums are made block by block, so this number is part of the bits
 ALIGNMENT = 16  # float32 numbers in a cache line
 
 # columns of the table of layers, and the activations
@@ -26,19 +25,19 @@ NONE, TANH, RELU, ELU, SILU = range(5)
 ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU, nn.ELU: ELU, nn.SiLU: SILU}
 
 # columns of the table of components (of the action), and the kinds of a component
-KIND, PARAMETER, COUNT, COLUMN, MASK, DEVIATION, ENTROPY = range(7)
+KIND, PARAMETER, COUNT, COLUMN, MASK, DEVIATION, ENTROPY_ROW = range(7)
 CATEGORICAL, BERNOULLI, GAUSSIAN = range(3)
-KINDS = {"categorical": CATEGORICAL, "bernoulli": BERNOULLI, "gaussian": GAUSSIAN}
+COMPONENT_KINDS = {"categorical": CATEGORICAL, "bernoulli": BERNOULLI, "gaussian": GAUSSIAN}
 
 # entries of ``places``: offsets into the intermediate matrices, sizes of these, ranges of layers
 LOGITS, DELTAS, LOGS, ACTIONS, PENALTY, ENTROPIES, VECTORS = range(7)
-FEATURES, COLUMNS, WIDTH, PARAMETERS, LOG_STD, DEVIATIONS = range(7, 13)
+FEATURES, COLUMNS, MASK_WIDTH, PARAMETERS, LOG_STD, DEVIATIONS = range(7, 13)
 ACTOR_FIRST, ACTOR_LAST, CRITIC_FIRST, CRITIC_LAST, TRUNK_LAST = range(13, 18)
 PLACES = 18
 
 # vectors of one number a row: offsets from places[VECTORS]
-LOGP, TOTAL_ENTROPY, OLD_LOGP, ADVANTAGE, COEFFICIENT, TOP = range(0, 6 * BLOCK, BLOCK)
-SUM, CHOSEN, RETURN, OLD_VALUE, RATIO = range(6 * BLOCK, 11 * BLOCK, BLOCK)
+LOGP, TOTAL_ENTROPY, OLD_LOGP, ADVANTAGE, COEFFICIENT, TOP = range(0, 6 * BLOCK_ROWS, BLOCK_ROWS)
+SUM, CHOSEN, RETURN, OLD_VALUE, RATIO = range(6 * BLOCK_ROWS, 11 * BLOCK_ROWS, BLOCK_ROWS)
 NUM_VECTORS = 11
 
 
@@ -138,7 +137,7 @@ def make_plan(policy: Any) -> Plan:
     parameters: list[tuple[nn.Parameter, int]] = []
     table: list[list[int]] = []
     cursor = 0
-    work = _aligned(policy.observation_layout.size * BLOCK)
+    work = _aligned(policy.observation_layout.size * BLOCK_ROWS)
 
     def place(parameter: Any) -> int:
         nonlocal cursor
@@ -148,7 +147,7 @@ def make_plan(policy: Any) -> Plan:
 
     def reserve(rows: int) -> int:
         nonlocal work
-        at, work = work, work + _aligned(rows * BLOCK)
+        at, work = work, work + _aligned(rows * BLOCK_ROWS)
         return at
 
     def add(modules: nn.Sequential, feed: int) -> tuple[int, int]:
@@ -176,7 +175,7 @@ def make_plan(policy: Any) -> Plan:
     components = np.zeros((len(layout.components), 7), np.int64)
     deviations = 0
     for i, c in enumerate(layout.components):
-        components[i] = [KINDS[c.kind], c.parameter, c.count, c.column, c.mask, deviations, i]
+        components[i] = [COMPONENT_KINDS[c.kind], c.parameter, c.count, c.column, c.mask, deviations, i]
         deviations += c.count if c.kind == "gaussian" else 0
     places = np.zeros(PLACES, np.int64)
     places[LOGITS], places[DELTAS] = table[actor[1] - 1][VALUE], table[actor[1] - 1][DELTA]
@@ -186,7 +185,7 @@ def make_plan(policy: Any) -> Plan:
     places[ENTROPIES] = reserve(len(components))
     places[VECTORS] = reserve(NUM_VECTORS)
     places[FEATURES], places[COLUMNS] = table[0][INPUTS], layout.num_columns
-    places[WIDTH], places[PARAMETERS] = layout.num_logits, layout.num_parameters
+    places[MASK_WIDTH], places[PARAMETERS] = layout.num_logits, layout.num_parameters
     places[LOG_STD], places[DEVIATIONS] = log_std, deviations
     places[ACTOR_FIRST:] = [*actor, *critic, trunk]
     halves = ((0, middle), (middle, cursor))

@@ -1,5 +1,4 @@
-"""What the kernels are made of: numba's options, instructions that numba has no words for, and exp, log and
-tanh.
+"""What the kernels are made of: numba's options, instructions that numba lacks, and exp, log and tanh.
 
 Never ``fastmath=True``: it promises the compiler that no NaN exists and makes every isnan and isfinite
 false. ``reassoc`` by itself turns x - x into 0, and np.isfinite, which numba builds on it, into True. Code
@@ -209,7 +208,7 @@ def store_shared(typing, array, index, value):
 
 
 @intrinsic
-def pause(typing):
+def spin_pause(typing):
     """Tell the core that this loop waits (x86; does nothing elsewhere)."""
 
     def generate(context, builder, signature, arguments):

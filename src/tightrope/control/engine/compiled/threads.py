@@ -18,7 +18,7 @@ import numpy as np
 from tightrope.control.engine.compiled.primitives import (
     composite,
     load_shared,
-    pause,
+    spin_pause,
     store_shared,
     yield_thread,
 )  # fmt: skip
@@ -40,7 +40,7 @@ def wait(control, index, count):
             return False
         spins += 1
         if spins < SPINS:
-            pause()
+            spin_pause()
         else:
             yield_thread()
     return True

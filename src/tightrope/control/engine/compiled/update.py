@@ -1,9 +1,9 @@
-"""Epochs of PPO, compiled: gather, forward, loss, backward, the joint norm, Adam; equations of
-algorithms/ppo.py.
+"""Epochs of PPO, compiled: gather, forward, loss, backward, the joint norm, Adam.
 
-A minibatch is worked on in blocks of BLOCK rows, whose gradients are added in order. ``role`` tells which
-half this thread does: ACTOR, CRITIC or BOTH. Either way each half is computed by the same operations in the
-same order, and the two meet in the same sum, so that the number of threads changes no bit.
+The equations are those of algorithms/ppo.py. A minibatch is worked on in blocks of BLOCK_ROWS, whose
+gradients are added in order. ``role`` tells which half this thread does: ACTOR, CRITIC or BOTH. Either way each half is
+computed by the same operations in the same order, and the two meet in the same sum, so that the number of
+threads changes no bit.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ ACTOR, CRITIC, BOTH = 1, 2, 3
 RUNNING, STOPPED, NOT_FINITE, MISMATCH, ALONE = range(5)
 
 # entries of ``options`` (float64)
-CLIP, CLIP_HIGH, VALUE_CLIP, VALUE_WEIGHT, ENTROPY_WEIGHT, TARGET_KL, MAX_NORM, NORMALISE = range(8)
+CLIP_LOW, CLIP_HIGH, VALUE_CLIP, VALUE_WEIGHT, ENTROPY_WEIGHT, TARGET_KL, MAX_NORM, NORMALISE = range(8)
 RATE, CRITIC_RATE, BETA_1, BETA_2, EPSILON, RATIO_LIMIT, STEPS_BEFORE, MINIBATCH = range(8, 16)
 ACTOR_FROM, ACTOR_TO, CRITIC_FROM, CRITIC_TO = range(16, 20)
 OPTIONS = 20
 
 # entries of a role's ledger (float64): sums of the update so far, and of the present minibatch
-ROWS_SEEN, POLICY, VALUES, ENTROPY, KL, HIGH, LOW, NORMS, NORM_COUNT = range(9)
-SMALLEST, LARGEST, FIRST, STEPS, KL_NOW, BAD_NOW, AT = range(9, 16)
+ROWS_SEEN, POLICY, VALUES, ENTROPY_SUM, KL, HIGH, LOW, NORMS, NORM_COUNT = range(9)
+RATIO_MIN, RATIO_MAX, FIRST, STEPS, KL_NOW, BAD_NOW, AT = range(9, 16)
 LEDGER = 16
 
 # ``exchange`` (float64): what each half publishes for both, [parity of the meeting, role, LEDGER]
@@ -62,7 +62,7 @@ def gather_mask(places, work, masks, order, begin, n):
     """Penalties [width, n]: 0 where allowed, -inf where masked."""
     for i in range(n):
         source = masks[order[begin + i]]
-        for d in range(places[plan.WIDTH]):
+        for d in range(places[plan.MASK_WIDTH]):
             work[places[plan.PENALTY] + d * n + i] = ZERO if source[d] else f(-np.inf)
 
 
@@ -98,7 +98,7 @@ def surrogate(places, work, n, count, options, ledger):
     logp, old = row(work, v + plan.LOGP, n), row(work, v + plan.OLD_LOGP, n)
     advantage, c = row(work, v + plan.ADVANTAGE, n), row(work, v + plan.COEFFICIENT, n)
     ratio, entropy = row(work, v + plan.RATIO, n), row(work, v + plan.TOTAL_ENTROPY, n)
-    low, high, share = f(1 - options[CLIP]), f(1 + options[CLIP_HIGH]), f(1.0 / count)
+    low, high, share = f(1 - options[CLIP_LOW]), f(1 + options[CLIP_HIGH]), f(1.0 / count)
     loss, kl, above, below, disorder = ZERO, ZERO, ZERO, ZERO, ZERO
     for i in range(n):
         x, a = logp[i] - old[i], advantage[i]
@@ -119,13 +119,13 @@ def surrogate(places, work, n, count, options, ledger):
     ledger[KL_NOW] += kl
     ledger[HIGH] += above
     ledger[LOW] += below
-    ledger[ENTROPY] += disorder
+    ledger[ENTROPY_SUM] += disorder
     smallest, largest = ratio[0], ratio[0]
     for i in range(n):
         smallest = ratio[i] if ratio[i] < smallest else smallest
         largest = ratio[i] if ratio[i] > largest else largest
-    ledger[SMALLEST] = smallest if smallest < ledger[SMALLEST] else ledger[SMALLEST]
-    ledger[LARGEST] = largest if largest > ledger[LARGEST] else ledger[LARGEST]
+    ledger[RATIO_MIN] = smallest if smallest < ledger[RATIO_MIN] else ledger[RATIO_MIN]
+    ledger[RATIO_MAX] = largest if largest > ledger[RATIO_MAX] else ledger[RATIO_MAX]
     if ledger[NORM_COUNT] == 0:
         for i in range(n):
             x = abs(logp[i] - old[i])
@@ -217,8 +217,8 @@ def gradients(role, places, layers, components, flat, grad, work, data, order, b
             scale = advantage_moments(data[5], order, begin, end)
     if role & CRITIC:
         ledgers[1, BAD_NOW] = 0
-    for at in range(begin, end, plan.BLOCK):
-        n, more = plan.BLOCK if end - at > plan.BLOCK else end - at, at > begin
+    for at in range(begin, end, plan.BLOCK_ROWS):
+        n, more = plan.BLOCK_ROWS if end - at > plan.BLOCK_ROWS else end - at, at > begin
         gather_inputs(places, work, data[0], order, at, n)
         forward(flat, layers, runtime(0), trunk, work, n)
         if role & ACTOR:
@@ -340,7 +340,7 @@ def save_ledgers(role, ledgers, start):
     "float32[::1], float32[::1], float32[::1], int64[::1], float64[::1], int64[::1],"
     "float64[::1], float64[:,::1])"
 )
-def train(
+def run_epochs(
     role, begin, epoch, epochs, places, layers, components, flat, grad, moment, square, work,
     inputs, masks, actions, old_logp, old_values, advantages, returns, order, options, control, exchange,
     ledgers,
