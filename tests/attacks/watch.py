@@ -29,7 +29,8 @@ from unittest import mock
 MARK = "attackmark"
 TEMPLATE = "<template>"  # of a chat, in jinja2's sandbox
 PROGRAMS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "socket.connect", "ctypes.dlopen")
-CACHE = str(Path("tightrope", "control", "engine", "compiled", "cache.py"))  # numba's compile cache: an exception
+# numba's compile cache: an exception
+CACHE = str(Path("tightrope", "control", "engine", "compiled", "cache.py"))
 SPAWN, BEGUN = str(Path("multiprocessing", "spawn.py")), str(Path("multiprocessing", "process.py"))
 TESTS = Path(__file__).parents[1]
 SOURCE = str(TESTS.parent / "src")

@@ -1,9 +1,9 @@
 """Epochs of PPO, compiled: gather, forward, loss, backward, the joint norm, Adam.
 
 The equations are those of algorithms/ppo.py. A minibatch is worked on in blocks of BLOCK_ROWS, whose
-gradients are added in order. ``role`` tells which half this thread does: ACTOR, CRITIC or BOTH. Either way each half is
-computed by the same operations in the same order, and the two meet in the same sum, so that the number of
-threads changes no bit.
+gradients are added in order. ``role`` tells which half this thread does: ACTOR, CRITIC or BOTH. Either way
+each half is computed by the same operations in the same order, and the two meet in the same sum, so that the
+number of threads changes no bit.
 """
 
 from __future__ import annotations
