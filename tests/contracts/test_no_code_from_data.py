@@ -53,7 +53,7 @@ EXCEPTIONS = {
     ("control/environments/processes.py", "CloudpickleWrapper"): TRANSPORT,
     ("control/environments/processes.py", "multiprocessing"): TRANSPORT,
     ("control/engine/compiled/cache.py", "pickle"): CACHE,
-    ("control/engine/compiled/numba_tools.py", "exec_module"): SCIPY,
+    ("control/engine/compiled/primitives.py", "exec_module"): SCIPY,
     ("cli/main.py", "import_module"): NAMED_BY_THE_USER,
     ("cli/main.py", "exec_module"): NAMED_BY_THE_USER,
     ("cli/main.py", "spec_from_file_location"): NAMED_BY_THE_USER,

@@ -57,7 +57,7 @@ def _optional(module: str, what: str, command: str) -> Finding:
 
 
 def _engine() -> Finding:
-    from tightrope.control.engine.compiled import compilation_due
+    from tightrope.control.engine.compiled.cache import compilation_due
 
     due = compilation_due()
     seen = "compiles at its first use, about 15 seconds" if due else "compiled for this machine"

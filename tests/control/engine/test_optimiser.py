@@ -7,7 +7,7 @@ import torch
 from engine_cases import difference, make, make_batch, numbers
 
 from tightrope.algorithms import ppo
-from tightrope.control.engine.compiled import FusedEngine
+from tightrope.control.engine.compiled.fused import FusedEngine
 
 
 def rng(seed):

@@ -12,7 +12,8 @@ import pytest
 from engine_cases import SPACES, difference, make, make_batch, numbers
 
 from tightrope.algorithms import ppo
-from tightrope.control.engine.compiled import FusedEngine, unsupported
+from tightrope.control.engine.compiled.fused import FusedEngine
+from tightrope.control.engine.compiled.plan import unsupported
 from tightrope.control.engine.compiled.threads import LEFT
 
 SETTINGS = {
@@ -200,7 +201,7 @@ def test_the_process_ends_cleanly_right_after_an_update_with_two_threads():
     lines = [
         "import numpy as np",
         "from engine_cases import make, make_batch",
-        "from tightrope.control.engine.compiled import FusedEngine",
+        "from tightrope.control.engine.compiled.fused import FusedEngine",
         "policy, optimiser, settings = make()",
         "engine = FusedEngine(policy, optimiser, 2)",
         "engine.update(policy, optimiser, make_batch(policy), settings, np.random.default_rng(0))",

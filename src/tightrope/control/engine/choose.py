@@ -124,7 +124,7 @@ class CompiledEngine:
     device = torch.device("cpu")
 
     def __init__(self, policy: Policy, optimiser: torch.optim.Optimizer, threads: int) -> None:
-        from tightrope.control.engine.compiled import FusedEngine
+        from tightrope.control.engine.compiled.fused import FusedEngine
 
         self.policy = policy
         self.fused = FusedEngine(policy, optimiser, threads)
@@ -211,12 +211,14 @@ def choose(
     """
     if settings.engine == "torch":
         return TorchEngine(policy, settings), "engine: torch, as asked"
-    from tightrope.control.engine.compiled import compilation_due, unsupported, when_compiled
+    from tightrope.control.engine.compiled.plan import unsupported
 
     reason = unsupported(policy, settings.update, policy.device, settings.algorithm)
     if reason is None and settings.compile:
         reason = "--compile"
     if reason is None:
+        from tightrope.control.engine.compiled.cache import compilation_due, when_compiled
+
         if compilation_due():
             notify(f"compiling the CPU engine: about 15 seconds, {when_compiled()} ...")
         return CompiledEngine(

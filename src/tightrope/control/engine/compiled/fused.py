@@ -1,5 +1,4 @@
-"""The engine's face: torch's parameters and Adam re-homed into flat memory, and the calls into compiled
-code."""
+"""The engine as Python sees it: torch's parameters and Adam in flat memory, and calls of compiled code."""
 
 from __future__ import annotations
 
@@ -14,54 +13,45 @@ import torch
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
-from tightrope.algorithms.nonfinite import NonFiniteError
-from tightrope.algorithms.optimise import SamplingMismatch
+from tightrope.algorithms.nonfinite import NonFiniteError, explain
+from tightrope.algorithms.optimise import check_first_ratios
 from tightrope.algorithms.settings import PPOSettings
-from tightrope.control.engine.compiled import diagnose, plan
-from tightrope.control.engine.compiled import numba_tools as compiled
+from tightrope.control.engine.compiled import cache, infer, plan, threads
+from tightrope.control.engine.compiled import update as kernels
 
-_began = time.perf_counter()
-_cold = compiled.compilation_due()
-from tightrope.control.engine.compiled import infer  # noqa: E402  (this import and the last one compile)
-from tightrope.control.engine.compiled import threads as helping  # noqa: E402
-from tightrope.control.engine.compiled import update as kernels  # noqa: E402
-
-compiled.mark_complete()
-COMPILE_SECONDS = time.perf_counter() - _began if _cold else 0.0
+cache.mark_complete()  # importing infer and update has compiled or loaded every entry
 
 Array = np.ndarray
 _NOTHING = np.zeros(0, np.float32)
 _NO_MASK = np.zeros((0, 1), bool)
 
-
-# For the comparison with ppo.py: an Adam whose step is nearly the gradient itself. With its own tiny epsilon
-# a gradient of pure rounding error would move a parameter by a whole learning rate.
+# For the comparison with ppo.py: an Adam whose step is nearly the gradient itself. With its usual tiny
+# epsilon a gradient of pure rounding error would move a parameter by a whole learning rate.
 SMOOTH = {"lr": 1.0, "eps": 1.0}
 
 
 class FusedEngine:
     """The compiled execution of ``ppo.update`` for one policy and its optimiser (torch.optim.Adam).
 
-    Both stay torch's: every parameter, and every moment of Adam, is a view of flat memory that the engine
-    works on.
-    ``threads`` 2: actor and critic on a core each, unless they share a trunk; the bits are those of 1.
+    Both remain torch objects: every parameter, and every moment of Adam, is a view of flat memory that the
+    engine works on. ``num_threads`` 2: actor and critic on a core each, unless they share a trunk; the bits
+    are those of 1.
     """
 
-    def __init__(self, policy: Any, optimiser: torch.optim.Optimizer, threads: int) -> None:
-        self.policy, self.optimiser, self.threads = policy, optimiser, threads
-        self.compile_seconds = COMPILE_SECONDS
+    def __init__(self, policy: Any, optimiser: torch.optim.Optimizer, num_threads: int) -> None:
+        self.policy, self.optimiser = policy, optimiser
         self._plan = plan.make_plan(policy)
         self._flat, self._grad = plan.aligned_zeros(self._plan.size), plan.aligned_zeros(self._plan.size)
         self._moment, self._square = plan.aligned_zeros(self._plan.size), plan.aligned_zeros(self._plan.size)
         self._steps = np.zeros(len(self._plan.parameters), np.float32)
         self._homes = [x.ctypes.data for x in (self._flat, self._moment, self._square, self._steps)]
         self._work = [plan.aligned_zeros(self._plan.work_size)]
-        self._helper, self._pace = helping.Helper(), helping.Pace(both=threads > 1 and policy.trunk is None)
+        self._helper = threads.Helper()
+        self._choice = threads.ThreadChoice(both=num_threads > 1 and policy.trunk is None)
         self.attach()
 
     def attach(self) -> None:
-        """Make parameters and Adam's state views of the flat memory (again), taking over the numbers they
-        hold."""
+        """Make parameters and Adam's state views of the flat memory, with the numbers they hold now."""
         if self._attached():
             return
         known = {id(p) for group in self.optimiser.param_groups for p in group["params"]}
@@ -95,7 +85,7 @@ class FusedEngine:
         return part
 
     def close(self) -> None:
-        """End the helping thread; a later update starts it again."""
+        """End the critic's thread; a later update starts it again."""
         self._helper.stop()
 
     # --- rollout
@@ -112,25 +102,23 @@ class FusedEngine:
         logp_out: Array,
         inputs_out: Array,
     ) -> None:
-        """Act on observations [B, D] float32 as they came; fills actions [B, A], logp [B] and inputs [B, D]
-        as seen.
+        """Act on raw observations [B, D] float32; fills actions [B, A], logp [B] and normalised inputs [B,
+        D].
 
         ``mean`` None: no normalisation. ``noise`` [B, A]: uniforms for categories and bits, normals for
-        Gaussians.
-        The three outputs may be strided columns of a rollout.
+        Gaussians. The three outputs may be strided columns of a rollout.
         """
-        numbers = (_NOTHING, _NOTHING) if mean is None else (mean, inverse_std)
-        masks = _NO_MASK if action_mask is None else action_mask
-        p = self._plan
-        infer.act(
-            p.places, p.layers, p.heads, self._flat, self._work[0], flat, *numbers, clip, masks, noise,
-            actions_out, logp_out, inputs_out,
+        p, masks = self._plan, _NO_MASK if action_mask is None else action_mask
+        mean, inverse_std = (_NOTHING, _NOTHING) if mean is None else (mean, inverse_std)
+        infer.act_batch(
+            p.places, p.layers, p.components, self._flat, self._work[0], flat, mean, inverse_std, clip, masks,
+            noise, actions_out, logp_out, inputs_out,
         )  # fmt: skip
 
     def values(self, flat: Array) -> Array:
         """Values [N] float32 of inputs [N, D], already normalised."""
         out = np.empty(len(flat), np.float32)
-        infer.values(self._plan.places, self._plan.layers, self._flat, self._work[0], _float(flat), out)
+        infer.value_batch(self._plan.places, self._plan.layers, self._flat, self._work[0], _float(flat), out)
         return out
 
     def gae(
@@ -152,7 +140,7 @@ class FusedEngine:
             raise ValueError(
                 f"All arrays of gae must have one shape; got {[x.shape for x in (*numbers, *flags)]}."
             )
-        infer.gae(*numbers, *flags, gamma, gae_lambda, out)
+        infer.gae_batch(*numbers, *flags, gamma, gae_lambda, out)
         return out
 
     # --- learning
@@ -175,29 +163,39 @@ class FusedEngine:
             raise ValueError("This engine was made for another policy or optimiser; make one for these.")
         if extra_loss is not None or draw is not None or settings.recompute_advantages:
             raise ValueError(
-                "The compiled engine knows no extra_loss, draw, recompute_advantages; use ppo.update."
+                "The compiled engine does not support extra_loss, draw, recompute_advantages; use ppo.update."
             )
         batch.require_steps()
         self.attach()
         rows, columns = _rows(batch), _columns(batch)
         run = _Run(self, columns, self._options(settings, log_ratio_limit))
-        began, together = time.perf_counter(), self._pace.choose()
+        began, together = time.perf_counter(), self._choice.choose()
         status = run.epochs(rows, rng, settings.num_epochs, together)
-        self._pace.book(together, time.perf_counter() - began, int(run.ledgers[0, kernels.NORM_COUNT]))
+        self._choice.record(together, time.perf_counter() - began, int(run.ledgers[0, kernels.NORM_COUNT]))
         self._steps += np.float32(run.ledgers[0, kernels.STEPS])
         if status == kernels.NOT_FINITE:
-            at = int(run.ledgers[0, kernels.AT])
-            number = at // settings.minibatch_size
-            there = run.order[at : at + settings.minibatch_size]
-            raise NonFiniteError(
-                diagnose.describe(self, columns, there, run.epoch, number, batch.mask.shape[1])
-            )
+            raise NonFiniteError(self._explain(run, batch, settings))
         if status == kernels.MISMATCH:
-            raise SamplingMismatch(diagnose.mismatch(run.ledgers[0, kernels.FIRST], log_ratio_limit))
+            check_first_ratios(torch.tensor(run.ledgers[0, kernels.FIRST]), log_ratio_limit)
         return run.metrics()
 
+    def _explain(self, run: _Run, batch: Batch, settings: PPOSettings) -> str:
+        """The message of the minibatch that was refused, as ppo.update gives it."""
+        k, (actor, critic), size = kernels, run.ledgers[:2], settings.minibatch_size
+        start = int(actor[k.AT])
+        where = f"in minibatch {start // size + 1} of epoch {run.epoch + 1}"
+        rows = torch.from_numpy(run.order[start : start + size])
+        minibatch = batch.map(lambda x: x.flatten(0, 1).unsqueeze(1)).select(rows)
+        sums = torch.tensor([actor[k.KL_NOW], actor[k.POLICY] + critic[k.VALUES]], dtype=torch.float64)
+        for parameter, at in self._plan.parameters:
+            part = torch.from_numpy(self._grad[at : at + parameter.numel()])
+            parameter.grad = part.view(parameter.shape)
+        message = explain(self.policy, self.optimiser, batch, minibatch, where, sums)
+        self.optimiser.zero_grad()  # torch shall not see the flat memory of the gradients
+        return message
+
     def _options(self, settings: PPOSettings, limit: float | None) -> Array:
-        """Numbers for the compiled code; learning rates, betas and epsilon are the optimiser's own."""
+        """Numbers for the compiled code; learning rates, betas and epsilon are those of the optimiser."""
         k, options = kernels, np.zeros(kernels.OPTIONS)
         groups = {id(p): group for group in self.optimiser.param_groups for p in group["params"]}
         for half, (begin, end) in enumerate(self._plan.halves):
@@ -210,7 +208,7 @@ class FusedEngine:
             options[k.ACTOR_FROM + 2 * half], options[k.ACTOR_TO + 2 * half] = begin, end
         first = self.optimiser.param_groups[0]
         (options[k.BETA_1], options[k.BETA_2]), options[k.EPSILON] = first["betas"], first["eps"]
-        options[k.CLIP] = settings.clip
+        options[k.CLIP_LOW] = settings.clip
         options[k.CLIP_HIGH] = settings.clip if settings.clip_high is None else settings.clip_high
         options[k.VALUE_CLIP] = settings.value_clip or 0.0
         options[k.VALUE_WEIGHT], options[k.ENTROPY_WEIGHT] = settings.value_weight, settings.entropy_weight
@@ -251,24 +249,24 @@ class _Run:
 
     def __init__(self, engine: FusedEngine, columns: list[Array], options: Array) -> None:
         self.engine, self.columns, self.options = engine, columns, options
-        self.control = np.zeros(helping.CONTROL_SIZE, np.int64)
+        self.control = np.zeros(threads.CONTROL_SIZE, np.int64)
         self.exchange, self.ledgers = np.zeros(4 * kernels.LEDGER), np.zeros((4, kernels.LEDGER))
-        self.ledgers[0, [kernels.SMALLEST, kernels.LARGEST]] = np.inf, -np.inf
+        self.ledgers[0, [kernels.RATIO_MIN, kernels.RATIO_MAX]] = np.inf, -np.inf
         self.epoch, self.order = 0, np.zeros(0, np.int64)
 
     def _call(self, role: int, begin: int, epoch: int, epochs: int) -> int:
         e, p = self.engine, self.engine._plan
         work = e._work[1 if role == kernels.CRITIC else 0]
-        return kernels.train(
-            role, begin, epoch, epochs, p.places, p.layers, p.heads, e._flat, e._grad, e._moment, e._square,
-            work,
+        return kernels.run_epochs(
+            role, begin, epoch, epochs, p.places, p.layers, p.components,
+            e._flat, e._grad, e._moment, e._square, work,
             *self.columns, self.order, self.options, self.control, self.exchange, self.ledgers,
         )  # fmt: skip
 
     def epochs(self, rows: Array | int, rng: np.random.Generator, num_epochs: int, together: bool) -> int:
         """Run all epochs; returns why it stopped. A permutation is drawn only when its epoch begins.
 
-        ``together``: the critic's half on the helping thread, should there be one.
+        ``together``: run the critic's half on the second thread if it can be started.
         """
         count = rows if isinstance(rows, int) else len(rows)
         self.order = np.empty(count, np.int64)
@@ -280,16 +278,14 @@ class _Run:
                 permutation = rng.permutation(count)
                 self.order[:] = permutation if isinstance(rows, int) else rows[permutation]
                 status = self._call(role, 0, self.epoch, self.epoch + 1)
-                if (
-                    status == kernels.ALONE
-                ):  # the helper is gone: the books go back, and this thread does both halves
+                if status == kernels.ALONE:  # restore the ledgers, and do both halves on this thread
                     role = kernels.BOTH
                     self.ledgers[:2] = self.ledgers[2:]
                     status = self._call(role, int(self.ledgers[0, kernels.AT]), self.epoch, self.epoch + 1)
                 if status != kernels.RUNNING:
                     break
         finally:
-            self.control[helping.LEFT] = 1
+            self.control[threads.LEFT] = 1
         return status
 
     def _helped(self, job: Callable[[], object]) -> bool:
@@ -305,14 +301,14 @@ class _Run:
         means = {
             "policy_gradient_loss": actor[k.POLICY] / rows,
             "value_loss": critic[k.VALUES] / critic[k.ROWS_SEEN],
-            "entropy": actor[k.ENTROPY] / rows,
+            "entropy": actor[k.ENTROPY_SUM] / rows,
             "approx_kl": actor[k.KL] / rows,
             "clip_fraction": (actor[k.HIGH] + actor[k.LOW]) / rows,
             "clip_fraction_high": actor[k.HIGH] / rows,
             "clip_fraction_low": actor[k.LOW] / rows,
             "grad_norm": actor[k.NORMS] / actor[k.NORM_COUNT],
-            "ratio_min": actor[k.SMALLEST],
-            "ratio_max": actor[k.LARGEST],
+            "ratio_min": actor[k.RATIO_MIN],
+            "ratio_max": actor[k.RATIO_MAX],
             "log_ratio_first": actor[k.FIRST],
             "minibatches": actor[k.STEPS],
         }

@@ -1,30 +1,34 @@
 """The rollout's side, compiled: act on a batch of observations, values of many, advantages."""
 
-# mypy: ignore-errors
-# (what numba makes of these functions is not what mypy sees)
 from __future__ import annotations
 
 import numpy as np
 
-from tightrope.control.engine.compiled import heads as h
-from tightrope.control.engine.compiled.dense import BLOCK, VALUE, ZERO, f, forward
-from tightrope.control.engine.compiled.numba_tools import entry, plain, row
+from tightrope.control.engine.compiled import plan
+from tightrope.control.engine.compiled.cache import entry
+from tightrope.control.engine.compiled.distributions import evaluate_actions, sample_actions
+from tightrope.control.engine.compiled.layers import forward
+from tightrope.control.engine.compiled.primitives import ZERO, f, row, runtime
 
 
 @entry(
     "void(int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1], float32[:,:], float32[::1],"
     "float32[::1], float64, boolean[:,:], float32[:,:], float32[:,:], float32[:], float32[:,:])"
 )
-def act(
-    places, layers, heads, flat, work, raw, mean, inverse, clip, masks, noise, actions, logp, inputs
+def act_batch(
+    places, layers, components, flat, work, raw, mean, inverse, clip, masks, noise, actions, logp, inputs
 ):  # fmt: skip
-    """Normalise, run the actor, sample, and write actions, log-probabilities and inputs as seen, row by
-    row."""
+    """Normalise, run the actor, sample; write actions, log-probabilities and normalised inputs.
+
+    Parameters in order: the tables of the plan; the buffers of parameters and of intermediate matrices; raw
+    observations [B, D]; mean and inverse [D] of the normaliser (empty: none) and its clip; action masks [B,
+    W] (no rows: none); noise [B, A]; outputs: actions [B, A], logp [B] and inputs [B, D].
+    """
     normalise, limit, masked = len(mean) > 0, f(clip), masks.shape[0] > 0
-    for begin in range(0, len(raw), BLOCK):
-        n = BLOCK if len(raw) - begin > BLOCK else len(raw) - begin
+    for begin in range(0, len(raw), plan.BLOCK_ROWS):
+        n = plan.BLOCK_ROWS if len(raw) - begin > plan.BLOCK_ROWS else len(raw) - begin
         for i in range(n):
-            for d in range(places[h.FEATURES]):
+            for d in range(places[plan.FEATURES]):
                 x = raw[begin + i, d]
                 if normalise:
                     x = (x - mean[d]) * inverse[d]
@@ -33,30 +37,30 @@ def act(
                 inputs[begin + i, d] = x
                 work[d * n + i] = x
             if masked:
-                for k in range(places[h.WIDTH]):
-                    work[places[h.PENALTY] + k * n + i] = ZERO if masks[begin + i, k] else f(-np.inf)
-        forward(flat, layers, plain(0), places[h.TRUNK_LAST], work, n)
-        forward(flat, layers, places[h.ACTOR_FIRST], places[h.ACTOR_LAST], work, n)
-        h.sample(places, heads, flat, work, noise, begin, n, masked)
-        h.evaluate(places, heads, flat, work, n, masked)
-        own = row(work, places[h.ROWS] + h.LOGP * BLOCK, n)
+                for k in range(places[plan.MASK_WIDTH]):
+                    work[places[plan.PENALTY] + k * n + i] = ZERO if masks[begin + i, k] else f(-np.inf)
+        forward(flat, layers, runtime(0), places[plan.TRUNK_LAST], work, n)
+        forward(flat, layers, places[plan.ACTOR_FIRST], places[plan.ACTOR_LAST], work, n)
+        sample_actions(places, components, flat, work, noise, begin, n, masked)
+        evaluate_actions(places, components, flat, work, n, masked)
+        own = row(work, places[plan.VECTORS] + plan.LOGP, n)
         for i in range(n):
             logp[begin + i] = own[i]
-            for k in range(places[h.COLUMNS]):
-                actions[begin + i, k] = work[places[h.ACTIONS] + k * n + i]
+            for k in range(places[plan.COLUMNS]):
+                actions[begin + i, k] = work[places[plan.ACTIONS] + k * n + i]
 
 
 @entry("void(int64[::1], int64[:,::1], float32[::1], float32[::1], float32[:,:], float32[::1])")
-def values(places, layers, flat, work, inputs, out):
+def value_batch(places, layers, flat, work, inputs, out):
     """The critic's value of every row of ``inputs``, already normalised."""
-    for begin in range(0, len(inputs), BLOCK):
-        n = BLOCK if len(inputs) - begin > BLOCK else len(inputs) - begin
+    for begin in range(0, len(inputs), plan.BLOCK_ROWS):
+        n = plan.BLOCK_ROWS if len(inputs) - begin > plan.BLOCK_ROWS else len(inputs) - begin
         for i in range(n):
-            for d in range(places[h.FEATURES]):
+            for d in range(places[plan.FEATURES]):
                 work[d * n + i] = inputs[begin + i, d]
-        forward(flat, layers, plain(0), places[h.TRUNK_LAST], work, n)
-        forward(flat, layers, places[h.CRITIC_FIRST], places[h.CRITIC_LAST], work, n)
-        value = row(work, layers[places[h.CRITIC_LAST] - 1, VALUE], n)
+        forward(flat, layers, runtime(0), places[plan.TRUNK_LAST], work, n)
+        forward(flat, layers, places[plan.CRITIC_FIRST], places[plan.CRITIC_LAST], work, n)
+        value = row(work, layers[places[plan.CRITIC_LAST] - 1, plan.VALUE], n)
         for i in range(n):
             out[begin + i] = value[i]
 
@@ -65,9 +69,11 @@ def values(places, layers, flat, work, inputs, out):
     "void(float32[:,::1], float32[:,::1], float32[:,::1], boolean[:,::1], boolean[:,::1], boolean[:,::1],"
     "float64, float64, float32[:,::1])"
 )
-def gae(rewards, values, next_values, terminated, ended, mask, gamma, gae_lambda, out):
-    """A_t = r_t + gamma V_{t+1} - V_t + gamma lambda A_{t+1}, cut as in maths.returns.gae, whatever lies
-    behind a cut."""
+def gae_batch(rewards, values, next_values, terminated, ended, mask, gamma, gae_lambda, out):
+    """A_t = r_t + gamma V_{t+1} - V_t + gamma lambda A_{t+1}, cut as in maths.returns.gae.
+
+    Numbers behind a cut may be anything: they are not used.
+    """
     discount, decay = f(gamma), f(gamma * gae_lambda)
     for b in range(rewards.shape[0]):
         trace = ZERO

@@ -1,12 +1,10 @@
 """Two threads in one minibatch: each owns half of the parameters, and they meet at the joint gradient norm.
 
-A meeting is a counter per thread, written with release and read with acquire. A thread that waits spins for
-a while and then gives its core away; it stops waiting when the other has left. Nothing here can change a bit
-of the result.
+A meeting is a counter per thread, written with release and read with acquire. A thread that waits spins for a
+while and then yields its core; it stops waiting when the other has left. Nothing here can change a bit of the
+result.
 """
 
-# mypy: ignore-errors
-# (what numba makes of these functions is not what mypy sees)
 from __future__ import annotations
 
 import contextlib
@@ -17,9 +15,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tightrope.control.engine.compiled.numba_tools import give_way, glue, load_shared, pause, store_shared
+from tightrope.control.engine.compiled.primitives import (
+    composite,
+    load_shared,
+    spin_pause,
+    store_shared,
+    yield_thread,
+)  # fmt: skip
 
-# entries of ``control`` (int64), each on a cache line of its own; role 0 is the actor's thread, role 1 the
+# entries of ``control`` (int64), each on its own cache line; role 0 is the actor's thread, role 1 the
 # critic's
 ARRIVED, LEFT, EPOCH = 0, 32, 48
 LINE = 16
@@ -27,7 +31,7 @@ CONTROL_SIZE = 64
 SPINS = 2000
 
 
-@glue
+@composite
 def wait(control, index, count):
     """Wait until ``control[index]`` has reached ``count``; False when the other thread has left for good."""
     spins = 0
@@ -36,13 +40,13 @@ def wait(control, index, count):
             return False
         spins += 1
         if spins < SPINS:
-            pause()
+            spin_pause()
         else:
-            give_way()
+            yield_thread()
     return True
 
 
-@glue
+@composite
 def meet(control, role):
     """Arrive, and wait for the other; False when the other has left."""
     count = load_shared(control, ARRIVED + LINE * role) + 1
@@ -53,9 +57,8 @@ def meet(control, role):
 class Helper:
     """A thread that runs the critic's half of updates; made when first needed, also again after a fork.
 
-    It ends with this object, and before the interpreter does: a thread that comes back from compiled code
-    while
-    the interpreter is being taken down aborts the process.
+    It ends with this object, and before the interpreter does: a thread that returns from compiled code while
+    the interpreter shuts down aborts the process.
     """
 
     def __init__(self) -> None:
@@ -64,14 +67,14 @@ class Helper:
         self._end: weakref.finalize | None = None
 
     def start(self, job: Callable[[], object], control: np.ndarray) -> bool:
-        """Run ``job`` beside the caller; False if there is no thread to be had. ``control[LEFT]`` tells
-        the end."""
+        """Run ``job`` beside the caller; ``control[LEFT]`` becomes 1 when it ends. False: no thread
+        available."""
         if self._thread is None or not self._thread.is_alive():
             jobs: queue.SimpleQueue = queue.SimpleQueue()
             thread = threading.Thread(target=_serve, args=(jobs,), name="tightrope-critic", daemon=True)
             try:
                 thread.start()
-            except RuntimeError:  # the system grants no more threads
+            except RuntimeError:  # the system allows no more threads
                 return False
             self._thread, self._jobs = thread, jobs
             self._end = weakref.finalize(self, _end, thread, jobs)
@@ -88,7 +91,7 @@ class Helper:
 def _serve(jobs: queue.SimpleQueue) -> None:
     while (task := jobs.get()) is not None:
         job, control = task
-        with contextlib.suppress(BaseException):  # the other thread sees it, and does both halves
+        with contextlib.suppress(BaseException):  # the other thread sees LEFT and does both halves
             job()
         control[LEFT] = 1
         del task, job, control
@@ -100,11 +103,11 @@ def _end(thread: threading.Thread, jobs: queue.SimpleQueue) -> None:
         thread.join(timeout=10)
 
 
-class Pace:
-    """Whether the second thread helps: on a machine whose cores are busy it costs more than it brings.
+class ThreadChoice:
+    """Whether to use the second thread: on a machine whose cores are busy it costs more than it saves.
 
-    Both ways are timed, and the quicker one is taken; every ``RETRY`` updates the other is tried again. The
-    result is the same bit for bit, or a timing would have no business here.
+    Both ways are timed, and the quicker one is used; every ``RETRY`` updates the other is tried again.
+    Timings may decide this because both give the same bits.
     """
 
     RETRY = 16
@@ -120,7 +123,7 @@ class Pace:
         quicker = self.seconds[True] <= self.seconds[False]
         return not quicker if self.updates % self.RETRY == 0 else quicker
 
-    def book(self, together: bool, seconds: float, minibatches: int) -> None:
+    def record(self, together: bool, seconds: float, minibatches: int) -> None:
         """Note how long an update took."""
         self.updates += 1
         if minibatches > 0:
