@@ -26,7 +26,7 @@ from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import Collector, Rollout, to_batch
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces.observations import ObservationLayout
+from tightrope.control.spaces import ObservationLayout
 from tightrope.maths.values import explained_variance
 from tightrope.training.grid import crosses
 

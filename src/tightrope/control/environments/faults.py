@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tightrope.control.spaces.nested import MASK_KEY
+from tightrope.control.spaces import MASK_KEY
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.05, 2.0  # seconds before a copy is made anew; doubled each time
 

@@ -35,8 +35,7 @@ from tightrope.control.environments.faults import (
 )
 from tightrope.control.environments.step import Slots
 from tightrope.control.environments.tasks import check_alike, make_all
-from tightrope.control.spaces.nested import MASK_KEY
-from tightrope.control.spaces.observations import Inputs, action_layout, observation_layout
+from tightrope.control.spaces import MASK_KEY, Inputs, action_layout, observation_layout
 
 
 class EnvGroup:

@@ -32,7 +32,7 @@ from tightrope.control.environments.faults import (
 from tightrope.control.environments.step import Step
 from tightrope.control.environments.vectorised import VectorCopies
 from tightrope.control.environments.watchdog import Watchdog
-from tightrope.control.spaces.observations import Inputs
+from tightrope.control.spaces import Inputs
 
 
 class GuardedVector:

@@ -15,7 +15,7 @@ from tightrope.control.environments.pool import EnvCopies
 from tightrope.control.environments.processes import available_cores
 from tightrope.control.environments.step import Step
 from tightrope.control.environments.vectorised import VectorCopies
-from tightrope.control.spaces.observations import Inputs
+from tightrope.control.spaces import Inputs
 
 __all__ = [
     "Backend",

@@ -29,7 +29,7 @@ from tightrope.control.environments.processes import SPIN, SharedArray, Worker, 
 from tightrope.control.environments.step import Slots, Step
 from tightrope.control.environments.tasks import check_alike, make_all
 from tightrope.control.environments.watchdog import Watchdog
-from tightrope.control.spaces.observations import (
+from tightrope.control.spaces import (
     ActionLayout,
     Inputs,
     ObservationLayout,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tightrope.control.spaces.observations import ActionLayout, Inputs, ObservationLayout
+from tightrope.control.spaces import ActionLayout, Inputs, ObservationLayout
 
 
 class Step(NamedTuple):

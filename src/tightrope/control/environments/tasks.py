@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from tightrope.control.spaces.observations import (
+from tightrope.control.spaces import (
     ActionLayout,
     ObservationLayout,
     action_layout,

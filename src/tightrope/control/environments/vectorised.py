@@ -18,8 +18,8 @@ from gymnasium.vector import AutoresetMode
 from tightrope.control.environments import state as states
 from tightrope.control.environments.faults import EnvironmentFault, describe
 from tightrope.control.environments.step import Step
-from tightrope.control.spaces.nested import MASK_KEY
-from tightrope.control.spaces.observations import (
+from tightrope.control.spaces import (
+    MASK_KEY,
     ActionLayout,
     Inputs,
     ObservationLayout,
