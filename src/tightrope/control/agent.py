@@ -19,8 +19,10 @@ from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.control.engine import choose as engines
 from tightrope.control.engine.cpu_threads import limited_threads
+from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
-from tightrope.control.environments.make import Environments, available_cores, make_environments
+from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.processes import available_cores
 from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve

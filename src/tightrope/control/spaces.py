@@ -284,7 +284,7 @@ class ActionLeaf:
     high: np.ndarray
 
     def to_env(self, actions: np.ndarray) -> np.ndarray:
-        """Columns of the action matrix to [N, *shape] in the space's dtype: start added, clipped to bounds."""
+        """Columns of the matrix to [N, *shape] in the space's dtype, start added, clipped to bounds."""
         space, shape = self.space, (len(actions), *(self.space.shape or ()))
         if isinstance(space, spaces.Box):
             values = np.minimum(np.maximum(actions[:, self.columns], self.low), self.high)

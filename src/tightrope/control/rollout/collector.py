@@ -15,8 +15,8 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
 from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
 from tightrope.control.environments import state as states
+from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import action_text, circumstances
-from tightrope.control.environments.make import Environments
 from tightrope.control.policy.normalise import Normalisers
 
 Array = np.ndarray
@@ -157,7 +157,7 @@ class Collector:
         rollout.finals, rollout.reward_statistics_taken = [], False
         noise = self.noise(num_steps, self.environments.num_envs, self.rng)
         engine.begin_rollout(self.environments.num_envs, self.rng)
-        waves = self.environments.waves
+        row_groups = self.environments.row_groups
         inputs, action_mask, t, env_seconds = self._inputs, self._action_mask, 0, 0.0
         try:
             for t in range(num_steps):
@@ -165,11 +165,11 @@ class Collector:
                     rollout.inputs["action_mask"][:, t] = action_mask
                 if keep_raw:
                     rollout.raw[:, t] = inputs["flat"]
-                for rows in waves:
+                for rows in row_groups:
                     engine.act(inputs, self.normalisers.observations, action_mask, noise[t], rollout, rows, t)
-                    self.environments.begin(rows, rollout.actions[rows, t])
+                    self.environments.send(rows, rollout.actions[rows, t])
                 before = perf_counter()
-                step = self.environments.finish()
+                step = self.environments.receive()
                 env_seconds += perf_counter() - before
                 inputs, action_mask = step.inputs, step.action_mask
                 rollout.rewards[:, t] = step.rewards
@@ -192,7 +192,7 @@ class Collector:
         rollout.last = self.normalisers.encode(inputs)
         rollout.finals = [(t, rows, self.normalisers.encode(x)) for t, rows, x in rollout.finals]
         rollout.ended |= rollout.terminated | rollout.truncated
-        if self.environments.restartable:
+        if self.environments.policy.restart:
             rollout.restarts = self.environments.restarts - self._restarts
             self._restarts = self.environments.restarts
         rollout.episodes = self._count_episodes(rollout)
