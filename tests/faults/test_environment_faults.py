@@ -23,8 +23,9 @@ import tightrope
 from tightrope.cli.main import main
 from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy, pause, restart_seed
 from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.processes import STEP
 from tightrope.control.resolve import resolve
-from tightrope.control.rollout.collector import BadNumbers
+from tightrope.control.rollout.rollout import BadNumbers
 from tightrope.control.train import resume, train
 from tightrope.runs.checkpoint import step_of
 
@@ -214,7 +215,7 @@ def test_death_is_survived_to_the_same_bits_each_time(agent_on):
 
 @pytest.mark.parametrize(("how", "rows"), [("raise", [3]), ("exit", [2, 3])])
 def test_the_failed_step_does_not_count_and_the_one_before_is_bootstrapped(how, rows, agent_on):
-    from tightrope.control.rollout.collector import to_batch
+    from tightrope.control.rollout.advantages import to_batch
 
     plain = {"normalise_observations": False, "normalise_rewards": False}
     agent = agent_on(how, on_env_fault="restart", length=12, **plain)
@@ -393,7 +394,7 @@ def test_hung_workers_are_ended_side_by_side():
     environments.reset(SMALL["seed"])
     for worker in environments._workers:
         for _ in range(AT):
-            worker.tell(b"s")
+            worker.send(STEP)
     time.sleep(0.5)
     begin = time.monotonic()
     environments.close()

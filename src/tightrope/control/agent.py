@@ -18,7 +18,7 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.control.engine import choose as engines
-from tightrope.control.engine.cpu_threads import limited_threads
+from tightrope.control.engine.base import limited_threads
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
@@ -26,7 +26,9 @@ from tightrope.control.environments.processes import available_cores
 from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve
-from tightrope.control.rollout.collector import Collector, Rollout, to_batch
+from tightrope.control.rollout.advantages import to_batch
+from tightrope.control.rollout.collector import Collector
+from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import ObservationLayout
 from tightrope.maths.values import explained_variance

@@ -113,6 +113,12 @@ class Normalisers:
             return inputs
         return {**inputs, "flat": self.observations(inputs["flat"])}
 
+    def start(self, rollout: Any) -> None:
+        """Give the reward normaliser its first statistics: the first rollout is scaled by its own."""
+        if self.rewards is not None and float(self.rewards.moments.count) == 0:
+            self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
+            rollout.reward_statistics_taken = True
+
     def update(self, rollout: Any) -> None:
         """Move the statistics, after the update on this rollout."""
         if self.observations is not None:
