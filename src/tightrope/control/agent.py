@@ -22,6 +22,7 @@ from tightrope.control.engine.base import limited_threads
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
 from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policy.policy import Policy
@@ -200,11 +201,9 @@ class Agent:
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
         rows = len(next(iter(inputs.values())))
         masks = layout.mask_of(observation) if action_masks is None and layout.has_mask else action_masks
-        flat_mask = actions.flatten_mask(masks, rows)
-        if flat_mask is not None:
-            if len(blocked := actions.blocked_rows(flat_mask)):
-                raise ValueError(f"action_masks forbid every choice in row {blocked[0]}; allow at least one.")
-            inputs = {**inputs, "action_mask": flat_mask}
+        action_mask = flat_mask(masks, rows, actions)
+        if action_mask is not None:
+            inputs = {**inputs, "action_mask": action_mask}
         tensors = self.policy.tensors(inputs)
         if deterministic:
             chosen = self.policy.mode(tensors)

@@ -16,8 +16,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from tightrope.control.spaces import MASK_KEY
-
 FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
 LONGEST_PAUSE = 2.0
 Result = TypeVar("Result")
@@ -225,7 +223,7 @@ def check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
     return result
 
 
-def check_step(result: Any, has_masks: bool) -> None:
+def check_step(result: Any) -> None:
     """Check the first step of an environment; ApiBreak names what it returned and what was expected."""
     if not isinstance(result, tuple) or len(result) != 5:
         raise ApiBreak(
@@ -240,10 +238,6 @@ def check_step(result: Any, has_masks: bool) -> None:
             raise ApiBreak(f"{name} is {flag!r}, expected True or False")
     if not isinstance(info, dict):
         raise ApiBreak(f"info is {describe(info)}, expected a dict")
-    if MASK_KEY in info and not has_masks:
-        raise ApiBreak(
-            f"step gives info[{MASK_KEY!r}] but reset did not; give it at every reset and every step"
-        )
 
 
 def check_finite(what: str, numbers: Any) -> None:

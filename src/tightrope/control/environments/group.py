@@ -29,7 +29,7 @@ from tightrope.control.environments.faults import (
     seed_of,
     wait_before_restart,
 )
-from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, find_source
+from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, check_first_step, find_source
 from tightrope.control.environments.tasks import check_alike, make_all
 from tightrope.control.spaces import Inputs, action_layout, observation_layout
 
@@ -142,7 +142,8 @@ class EnvGroup:
                 current[0] = row
                 result = envs[row].step(action)
                 if not checked:
-                    check_step(result, has_masks)
+                    check_step(result)
+                    check_first_step(result[4], has_masks)
                 observation, reward, terminated, truncated, info = result
                 rewards[row] = reward
                 if strict:
