@@ -1,7 +1,7 @@
 """The state of environments that can give it, as JSON; nothing is pickled.
 
 An environment takes part by two methods: ``get_state()`` returns what it is in the middle of, made of None,
-numbers, strings, bytes, lists, dicts with string keys and numpy arrays; ``set_state(state)`` goes on from
+numbers, strings, bytes, lists, dicts with string keys and numpy arrays; ``set_state(state)`` continues from
 there. Its generator ``np_random`` and Gymnasium's time limit are kept for it. A wrapper in between that has
 a state of its own needs the two methods itself, and then speaks for everything inside it.
 """

@@ -1,5 +1,4 @@
-"""From the actor's outputs to a distribution over actions: the one place that samplers and trainers both
-call.
+"""From the actor's outputs to a distribution over actions, for sampling and for training.
 
 An action is a row of ``num_columns`` float32 numbers: category indices, bits and Gaussian values side by
 side. Noise comes from outside (uniforms for categories and bits, standard normals for Gaussian columns), so
@@ -65,9 +64,7 @@ class Distribution:
         return torch.cat(parts, dim=1)
 
     def logp(self, actions: Tensor) -> Tensor:
-        """log pi(a) [N] of actions [N, A]; squashed: the density of the action in the environment's own
-        units.
-        """
+        """log pi(a) [N] of actions [N, A]; squashed: the density in the environment's units."""
         total = torch.zeros(len(actions), device=actions.device)
         for component in self.layout.components:
             x = actions[:, component.column : component.column + component.width]

@@ -1,6 +1,4 @@
-"""Running statistics of observations and rewards: frozen during a rollout and its update, moved between
-them.
-"""
+"""Running statistics of observations and rewards: frozen during a rollout and its update, moved after it."""
 
 from __future__ import annotations
 
@@ -81,7 +79,7 @@ class RewardNormaliser:
         self.moments = self.moments.update(torch.from_numpy(series[mask][:, None]))
 
     def restart(self, num_envs: int) -> None:
-        """Episodes begin anew: another environment, or a resumed run."""
+        """New episodes begin: another environment, or a resumed run."""
         self.running = np.zeros(num_envs)
 
     def state(self) -> dict[str, torch.Tensor]:
