@@ -10,7 +10,7 @@ from gymnasium import spaces
 from tightrope.control.policy.distributions import Distribution
 from tightrope.control.policy.policy import Policy
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces.observations import action_layout, observation_layout
+from tightrope.control.spaces import action_layout, observation_layout
 from tightrope.maths import divergence
 
 

@@ -17,7 +17,7 @@ import tightrope
 from tightrope.control import train
 from tightrope.control.agent import Agent
 from tightrope.control.environments import state as states
-from tightrope.control.environments.group import EnvironmentFault
+from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.control.environments.make import make_environments
 from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve
@@ -148,7 +148,7 @@ def test_five_hops_end_where_none_does(tmp_path, monkeypatch, kind):
 
 PHASES = {
     "evaluation": (train, "evaluate_agent", 2),
-    "rollout": ("tightrope.control.rollout.collector.Environments", "finish", 55),
+    "rollout": ("tightrope.control.environments.pool.EnvironmentPool", "receive", 55),
     "advantages": ("tightrope.control.agent", "to_batch", 4),
     "minibatch": ("tightrope.algorithms.ppo", "check_first_ratios", 4),
     "statistics": ("tightrope.control.policy.normalise.Normalisers", "update", 5),

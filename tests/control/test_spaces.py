@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from tightrope.control.spaces.observations import action_layout, observation_layout, spatial_sides
+from tightrope.control.spaces import action_layout, observation_layout, spatial_sides
 
 NESTED = spaces.Dict(
     {

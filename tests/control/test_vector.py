@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from tightrope.control.environments import processes as workers
-from tightrope.control.environments.faults import FaultPolicy
-from tightrope.control.environments.make import EnvironmentFault, make_environments
+from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy
+from tightrope.control.environments.make import make_environments
 
 COUNT = 40
 
@@ -213,7 +213,7 @@ from tightrope.control.environments.make import make_environments
 sets = [make_environments(chain.Chain, 3, backend="workers", num_workers=3) for _ in range(2)]
 for environments in sets:
     environments.reset(100)
-print(*[w._process.pid for e in sets for w in e._copies._workers], flush=True)
+print(*[w._process.pid for e in sets for w in e._workers], flush=True)
 {after}
 """
 

@@ -10,8 +10,8 @@ from gymnasium import spaces
 
 import tightrope
 from tightrope.cli.main import main
-from tightrope.control.environments.make import EnvironmentFault
-from tightrope.control.rollout.collector import BadNumbers
+from tightrope.control.environments.faults import EnvironmentFault
+from tightrope.control.rollout.rollout import BadNumbers
 
 SMALL = dict(num_envs=2, num_steps=16, minibatch_size=16, num_epochs=1, seed=0)
 

@@ -13,8 +13,7 @@ from language.tiny import saved
 from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.control import train
 from tightrope.control.agent import Agent
-from tightrope.control.environments import group as vector
-from tightrope.control.environments import pool as copies
+from tightrope.control.environments import faults
 from tightrope.language import align
 from tightrope.language.alignment.align import resume_align
 from tightrope.language.alignment.iteration import Trainer
@@ -44,8 +43,7 @@ class Sealed(Brittle):
 
 @pytest.mark.parametrize(("env", "workers"), [(Brittle, 1), (Brittle, 2), (Sealed, 1)])
 def test_restarts_are_counted_on_and_seeds_of_those_made_anew_go_on(tmp_path, monkeypatch, env, workers):
-    for module in (copies, vector):
-        monkeypatch.setattr(module, "pause", lambda *_: 0.0)
+    monkeypatch.setattr(faults, "pause", lambda *_: 0.0)
     settings = settings_for(
         env, on_env_fault="restart", max_env_restarts=500, num_workers=workers, engine="torch"
     )

@@ -18,15 +18,20 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.control.engine import choose as engines
-from tightrope.control.engine.cpu_threads import limited_threads
+from tightrope.control.engine.base import limited_threads
+from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
-from tightrope.control.environments.make import Environments, available_cores, make_environments
+from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.masks import flat_mask
+from tightrope.control.environments.processes import available_cores
 from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve
-from tightrope.control.rollout.collector import Collector, Rollout, to_batch
+from tightrope.control.rollout.advantages import to_batch
+from tightrope.control.rollout.collector import Collector
+from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces.observations import ObservationLayout
+from tightrope.control.spaces import ObservationLayout
 from tightrope.maths.values import explained_variance
 from tightrope.training.grid import crosses
 
@@ -196,11 +201,9 @@ class Agent:
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
         rows = len(next(iter(inputs.values())))
         masks = layout.mask_of(observation) if action_masks is None and layout.has_mask else action_masks
-        flat_mask = actions.flatten_mask(masks, rows)
-        if flat_mask is not None:
-            if len(blocked := actions.blocked_rows(flat_mask)):
-                raise ValueError(f"action_masks forbid every choice in row {blocked[0]}; allow at least one.")
-            inputs = {**inputs, "action_mask": flat_mask}
+        action_mask = flat_mask(masks, rows, actions)
+        if action_mask is not None:
+            inputs = {**inputs, "action_mask": action_mask}
         tensors = self.policy.tensors(inputs)
         if deterministic:
             chosen = self.policy.mode(tensors)

@@ -63,7 +63,7 @@ def _name_of(env: Any) -> str:
 def _describe(env: Any) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
     from tightrope.control.environments.make import make_environments
-    from tightrope.control.spaces.observations import action_layout, observation_layout
+    from tightrope.control.spaces import action_layout, observation_layout
 
     vector = hasattr(env, "single_observation_space")
     if vector or hasattr(env, "observation_space"):

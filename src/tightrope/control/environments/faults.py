@@ -1,29 +1,32 @@
-"""What an environment may do wrong, how it is named, and what is done about it.
+"""Faults of environments: how they are described, checked for, and answered by a restart.
 
-An `EnvironmentFault` says which copy, in which process, at which step, under which seed and action; the
-traceback of the environment's own error is part of it. A `FaultPolicy` says whether the run ends with it or
-the copy is made anew.
+An `EnvironmentFault` names the environment, its process, the step, the seed and the action, and includes the
+traceback of the environment's own error. A `FaultPolicy` decides whether the run ends or the environment is
+restarted. `Restarts` is the one loop that restarts, for single environments, processes and vector
+environments.
 """
 
 from __future__ import annotations
 
+import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from tightrope.control.spaces.nested import MASK_KEY
-
-FIRST_PAUSE, LONGEST_PAUSE = 0.05, 2.0  # seconds before a copy is made anew; doubled each time
+FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
+LONGEST_PAUSE = 2.0
+Result = TypeVar("Result")
 
 
 class EnvironmentFault(RuntimeError):
-    """An environment raised, hung, broke Gymnasium's API, or its process died; the message says all of it.
+    """An environment raised, hung or broke Gymnasium's API, or its process died.
 
-    ``index`` of the copy (-1: not known which), ``step`` since the last reset of all, ``env_id``, ``worker``
-    (0: this process), ``seed`` of the copy's last seeded reset, ``action``: the last one, as text. ``lost``:
-    the process that stepped the copy is gone or does not answer.
+    ``index``: which environment (-1: unknown). ``step``: since all were reset. ``worker``: its process (0:
+    this one). ``seed``: of its last seeded reset. ``action``: its last one, as text. ``lost``: its process is
+    gone or does not answer.
     """
 
     def __init__(
@@ -39,24 +42,39 @@ class EnvironmentFault(RuntimeError):
         lost: bool = False,
     ) -> None:
         super().__init__(message)
-        self.index, self.step, self.env_id, self.worker = index, step, env_id, worker
-        self.seed, self.action, self.lost = seed, action, lost
+        self.index = index
+        self.step = step
+        self.env_id = env_id
+        self.worker = worker
+        self.seed = seed
+        self.action = action
+        self.lost = lost
 
     def record(self) -> dict[str, Any]:
-        """What JSON needs to build it again in another process."""
-        facts = {name: getattr(self, name) for name in ("env_id", "worker", "seed", "action")}
-        return {"message": str(self), "index": self.index, "step": self.step, **facts}
+        """The arguments, as JSON, from which another process can build this fault again."""
+        names = ("index", "step", "env_id", "worker", "seed", "action")
+        return {"message": str(self), **{name: getattr(self, name) for name in names}}
 
 
 class ApiBreak(Exception):
-    """What an environment gave that Gymnasium's API does not allow; becomes an EnvironmentFault."""
+    """An environment returned what Gymnasium's API does not allow; becomes an EnvironmentFault.
+
+    ``index``: the row of a vector environment that did (-1: all, or unknown).
+    """
+
+    def __init__(self, message: str, index: int = -1) -> None:
+        super().__init__(message)
+        self.index = index
 
 
 class Overdue(BaseException):
-    """An environment of this process was not back in time; no ``except Exception`` of its own holds it."""
+    """An environment of this process exceeded its time limit.
+
+    A BaseException, so that the environment's own ``except Exception`` does not swallow it.
+    """
 
 
-# what counts as an environment's fault: a signal to this process does not
+# what counts as an environment's fault; a signal to this process does not
 RAISED = (Exception, SystemExit, GeneratorExit, Overdue)
 
 
@@ -73,24 +91,95 @@ def policy_of(settings: Any) -> FaultPolicy:
     return FaultPolicy(settings.on_env_fault == "restart", settings.max_env_restarts, settings.env_timeout)
 
 
-def renewed_seed(seed: int, renewals: int, index: int) -> int:
-    """The seed of a copy that was made anew: of the seed of all, how often, and which copy; nothing else."""
-    return int(np.random.SeedSequence([seed, renewals, index]).generate_state(1)[0])
+# ------------------------------------------------------------------------------------------------- restarts
 
 
-def pause(renewals: int, timeout: float | None) -> float:
-    """Seconds to wait before making a copy anew for the n-th time; well below the time limit."""
+class Restarts:
+    """Counts restarts, and restarts until it works or the policy's limit is reached."""
+
+    def __init__(self, policy: FaultPolicy) -> None:
+        self.policy = policy
+        self.count = 0
+
+    def until_it_works(
+        self,
+        fault: EnvironmentFault,
+        attempt: Callable[[], Result],
+        explain: Callable[[BaseException], EnvironmentFault],
+    ) -> Result:
+        """What ``attempt`` returns, called again after each fault of its own.
+
+        ``explain`` turns what ``attempt`` raised into a fault, or raises. Raises the last fault when the
+        limit is reached.
+        """
+        while True:
+            if self.count >= self.policy.max_restarts:
+                raise self.given_up(fault) from fault.__cause__
+            self.count += 1
+            try:
+                return attempt()
+            except RAISED as error:
+                fault = explain(error)
+
+    def given_up(self, fault: EnvironmentFault) -> EnvironmentFault:
+        """The fault that ends the run when the limit is reached."""
+        message = (
+            f"{fault}\nEnvironments were restarted {self.count} times; max_env_restarts allows no more. Fix "
+            "the environment, or allow more."
+        )
+        return EnvironmentFault(**{**fault.record(), "message": message})
+
+
+def restart_seed(seed: int, restarts: int, index: int) -> int:
+    """The seed of environment ``index`` after its n-th restart since all were reset with ``seed``."""
+    return int(np.random.SeedSequence([seed, restarts, index]).generate_state(1)[0])
+
+
+def seed_of(seed: int, restarts: int, index: int) -> int:
+    """The seed of environment ``index``: ``seed + index`` until its first restart."""
+    return restart_seed(seed, restarts, index) if restarts else seed + index
+
+
+def pause(restarts: int, timeout: float | None) -> float:
+    """Seconds to wait before the n-th restart; well below the time limit."""
     longest = LONGEST_PAUSE if timeout is None else min(LONGEST_PAUSE, timeout / 4)
-    return min(longest, FIRST_PAUSE * 2.0 ** min(renewals - 1, 20))
+    return min(longest, FIRST_PAUSE * 2.0 ** min(restarts - 1, 20))
 
 
-def given_up(fault: EnvironmentFault, restarts: int) -> EnvironmentFault:
-    """The fault at which restarting ends."""
-    text = (
-        f"{fault}\nEnvironments were made anew {restarts} times; max_env_restarts allows no more. Mend the "
-        "environment, or allow more."
-    )
-    return EnvironmentFault(text, **{k: v for k, v in fault.record().items() if k != "message"})
+def wait_before_restart(restarts: int, policy: FaultPolicy) -> None:
+    """Sleep for `pause`."""
+    time.sleep(pause(restarts, policy.timeout))
+
+
+# ------------------------------------------------------------------------------------------------- messages
+
+
+def explained(
+    error: BaseException,
+    who: str,
+    index: int,
+    step: int,
+    *,
+    env_id: str,
+    worker: int,
+    seed: int | None,
+    action: str | None,
+    advice: str = "",
+) -> EnvironmentFault:
+    """The fault for what ``who`` raised; an error of the environment's own brings its traceback."""
+    api = isinstance(error, ApiBreak)
+    if isinstance(error, Overdue):
+        what = f"was {error}"
+    elif api or raised_here(error):
+        what = f"does not follow Gymnasium's API: {error}"
+    else:
+        what = f"raised {type(error).__name__}: {error}"
+    message = f"{who} at step {step} {what}{circumstances(worker, seed, action)}{advice}"
+    if not api:
+        message += "\n" + "".join(traceback.format_exception(error)).rstrip()
+    fault = EnvironmentFault(message, index, step, env_id=env_id, worker=worker, seed=seed, action=action)
+    fault.__cause__ = error
+    return fault
 
 
 def circumstances(worker: int, seed: int | None, action: str | None) -> str:
@@ -106,14 +195,26 @@ def action_text(action: Any) -> str:
 
 
 def raised_here(error: BaseException) -> bool:
-    """True when the innermost frame is this library's: an answer could not be used, no environment raised."""
+    """Whether this library raised it, because it could not use what an environment returned."""
     frames = traceback.extract_tb(error.__traceback__)
-    ours = Path(__file__).parent
-    return bool(frames) and Path(frames[-1].filename).parent == ours
+    control = Path(__file__).parents[1]
+    return bool(frames) and control in Path(frames[-1].filename).parents
+
+
+def describe(value: Any) -> str:
+    """A value in a few words for an error message."""
+    if isinstance(value, tuple):
+        return f"a tuple of {len(value)} values"
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    return f"a {type(value).__name__}"
+
+
+# --------------------------------------------------------------------------------------------------- checks
 
 
 def check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
-    """The pair (observation, info) that ``reset`` gave; ApiBreak when it is something else."""
+    """The pair (observation, info) that ``reset`` returned; ApiBreak when it is something else."""
     if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
         raise ApiBreak(
             f"reset returned {describe(result)}, expected the pair (observation, info dict). "
@@ -122,13 +223,12 @@ def check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
     return result
 
 
-def check_step(result: Any, has_masks: bool) -> None:
-    """A close look at the first step of a copy; ApiBreak names what came and what was expected."""
+def check_step(result: Any) -> None:
+    """Check the first step of an environment; ApiBreak names what it returned and what was expected."""
     if not isinstance(result, tuple) or len(result) != 5:
         raise ApiBreak(
             f"step returned {describe(result)}, expected five values: observation, reward, terminated, "
-            "truncated, "
-            "info. Environments of the old gym API (four values) must be ported to Gymnasium 1.x"
+            "truncated, info. Environments of the old gym API (four values) must be ported to Gymnasium 1.x"
         )
     _, reward, terminated, truncated, info = result
     if isinstance(reward, str | bytes | None) or np.ndim(reward) != 0:
@@ -138,10 +238,6 @@ def check_step(result: Any, has_masks: bool) -> None:
             raise ApiBreak(f"{name} is {flag!r}, expected True or False")
     if not isinstance(info, dict):
         raise ApiBreak(f"info is {describe(info)}, expected a dict")
-    if MASK_KEY in info and not has_masks:
-        raise ApiBreak(
-            f"step gives info[{MASK_KEY!r}] but reset did not; give it at every reset and every step"
-        )
 
 
 def check_finite(what: str, numbers: Any) -> None:
@@ -151,12 +247,3 @@ def check_finite(what: str, numbers: Any) -> None:
         index = tuple(int(i) for i in np.argwhere(~good)[0])
         place = f" at index {', '.join(map(str, index))}" if index else ""
         raise ApiBreak(f"{what} = {np.asarray(numbers)[index]}{place}, expected finite numbers")
-
-
-def describe(value: Any) -> str:
-    """A value in a few words for an error message."""
-    if isinstance(value, tuple):
-        return f"a tuple of {len(value)} values"
-    return (
-        f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
-    )

@@ -1,15 +1,12 @@
-"""Some copies of one environment, stepped in this process (``EnvGroup``; other processes: workers.py).
+"""Several environments stepped one after the other in one process.
 
-Copies reset in the step in which they end, so that no row is ever wasted; the true final observation of a
-truncated episode is kept.
+Each is reset in the step in which its episode ends, so that no row is ever wasted; the true final observation
+of a truncated episode is kept.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
-import time
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -17,39 +14,37 @@ import gymnasium as gym
 import numpy as np
 
 from tightrope.control.environments import state as states
+from tightrope.control.environments.base import StepBuffers
 from tightrope.control.environments.faults import (
     RAISED,
     ApiBreak,
     EnvironmentFault,
     FaultPolicy,
-    Overdue,
+    Restarts,
     action_text,
     check_finite,
     check_reset,
     check_step,
-    circumstances,
-    given_up,
-    pause,
-    raised_here,
-    renewed_seed,
+    explained,
+    seed_of,
+    wait_before_restart,
 )
-from tightrope.control.environments.step import Slots
+from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, check_first_step, find_source
 from tightrope.control.environments.tasks import check_alike, make_all
-from tightrope.control.spaces.nested import MASK_KEY
-from tightrope.control.spaces.observations import Inputs, action_layout, observation_layout
+from tightrope.control.spaces import Inputs, action_layout, observation_layout
 
 
 class EnvGroup:
-    """Some copies stepped one after the other in this process, writing straight into their slots.
+    """Environments that write their steps straight into their rows of the buffers.
 
-    ``first``: index of the first copy among all. ``makers``: one function a copy, for a policy that makes it
-    anew after a fault. ``worker``: 0 in the main process.
+    ``first``: index of the first among all of the run. ``makers``: one function per environment, for a policy
+    that restarts it after a fault. ``worker``: number of this process, 0 for the main one.
     """
 
     def __init__(
         self,
         envs: Sequence[gym.Env],
-        slots: Slots,
+        buffers: StepBuffers,
         name: str,
         first: int = 0,
         *,
@@ -57,99 +52,98 @@ class EnvGroup:
         policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
         worker: int = 0,
     ) -> None:
-        self.envs, self.slots, self.name, self.first, self.worker = list(envs), slots, name, first, worker
+        self.envs = list(envs)
+        self.buffers = buffers
+        self.name = name
+        self.first = first
+        self.worker = worker
+        self.makers = makers
+        self.policy = policy
+        self.restarts = Restarts(policy)
         self.observation_layout = observation_layout(envs[0].observation_space)
         self.action_layout = action_layout(envs[0].action_space)
         self.has_masks = False
-        self.calls = 0  # steps and resets that have begun
-        self.makers, self.policy = makers, policy
-        self.renewed = 0  # copies made anew, in all
-        self._plain = self.observation_layout.plain
+        self._mask_sources = [MaskSource()] * len(envs)
         self._shape = envs[0].observation_space.shape
-        self._steps = [env.step for env in envs]
-        self._rows = [{k: a[i : i + 1] for k, a in slots.inputs.items()} for i in range(len(envs))]
-        self._final_rows = [
-            {k: a[i : i + 1] for k, a in slots.final_inputs.items()} for i in range(len(envs))
-        ]
+        self._plain = self.observation_layout.plain
+        self._rows = [{k: a[i : i + 1] for k, a in buffers.inputs.items()} for i in range(len(envs))]
+        self._finals = [{k: a[i : i + 1] for k, a in buffers.final_inputs.items()} for i in range(len(envs))]
         self._flat_rows = [row["flat"][0] for row in self._rows] if self._plain else []
-        self._mask_sources = [""] * len(envs)
-        self._mask_functions: list[Callable[[], Any]] = [dict] * len(envs)
-        self._checked = False  # the first step is looked at closely
-        self._ended = True  # the flags hold something to wipe
-        self._count, self._seed = 0, 0
-        self._seeds: list[int | None] = [None] * len(envs)
-        slots.under_way.fill(-1)
+        self._seed = 0
+        self._count = 0  # steps since the last reset of all
+        self._calls = 0  # steps and resets that have begun
+        self._checked = False  # the first step is checked closely
+        self._dirty = True  # a flag may be set
+        buffers.current.fill(-1)
 
     def reset(self, seed: int) -> None:
-        """Reset every copy; copy i (counted over all groups) gets ``seed + i``, one that was made anew a seed
-        of its own.
-        """
-        self._count, self._checked, self._ended, self._seed = 0, False, True, seed
-        self.slots.masks.fill(True)
-        self.slots.cut.fill(False)
+        """Reset all; environment i (counted over all groups) gets the seed ``seed + i``."""
+        self._seed = seed
+        self._count = 0
+        self._checked = False
+        self._dirty = True
+        self.buffers.masks.fill(True)
+        self.buffers.cut.fill(False)
         try:
             for row in range(len(self.envs)):
-                self._seeds[row] = self._seed_of(row)
                 try:
                     self._begin(row)
                 except RAISED as error:
-                    self._renew(row, error)
-            if self.has_masks:
-                self._check_masks()
+                    self._restart(row, error)
+            self._check_masks()
         finally:
-            self.slots.under_way[0] = -1
-
-    def _seed_of(self, row: int) -> int:
-        often, index = int(self.slots.renewals[row]), self.first + row
-        return renewed_seed(self._seed, often, index) if often else self._seed + index
-
-    def _begin(self, row: int) -> None:
-        """Reset one copy with its seed."""
-        self.calls += 1
-        self.slots.under_way[0] = row
-        observation, info = check_reset(self.envs[row].reset(seed=self._seeds[row]))
-        self._plain &= isinstance(observation, np.ndarray)
-        self.observation_layout.write(observation, self._rows[row])
-        if self.policy.restart:
-            self._check_row(row, self._rows)
-        self._find_mask(row, observation, info)
-        if self.has_masks:
-            self._store_mask(row, observation, info)
+            self.buffers.current[0] = -1
 
     def step(self) -> None:
-        """Step every copy with its row of ``slots.actions``; one that ends is reset at once."""
-        if self._ended:
-            for flags in (self.slots.terminated, self.slots.truncated, self.slots.cut):
+        """Step each with its row of ``buffers.actions``; one whose episode ends is reset at once."""
+        if self._dirty:
+            for flags in (self.buffers.terminated, self.buffers.truncated, self.buffers.cut):
                 flags.fill(False)
-            self._ended = False
+            self._dirty = False
         self._count += 1
-        self.calls += 1
-        actions, row = self.action_layout.rows(self.slots.actions), 0
+        self._calls += 1
+        actions = self.action_layout.rows(self.buffers.actions)
+        row = 0
         try:
             while row < len(self.envs):
                 row = self._step_from(row, actions)
             self._checked = True
-            if self.has_masks:
-                self._check_masks()
+            self._check_masks()
         finally:
-            self.slots.under_way[0] = -1
+            self.buffers.current[0] = -1
 
-    def busy(self) -> int | None:
-        """A number that changes with every call of an environment; None while there is none under way."""
-        row = int(self.slots.under_way[0])
-        return None if row < 0 else self.calls * len(self.envs) + row
+    def call_number(self) -> int | None:
+        """A number that changes with every call of an environment; None between calls."""
+        row = int(self.buffers.current[0])
+        return None if row < 0 else self._calls * len(self.envs) + row
+
+    def _begin(self, row: int) -> None:
+        """Reset one environment with its seed."""
+        self._calls += 1
+        self.buffers.current[0] = row
+        observation, info = check_reset(self.envs[row].reset(seed=self._seed_of(row)))
+        self._plain &= isinstance(observation, np.ndarray)
+        self.observation_layout.write(observation, self._rows[row])
+        if self.policy.restart:
+            self._check_row(self._rows[row], "observation")
+        self._find_mask(row, info)
+        if self.has_masks:
+            self._store_mask(row, observation, info)
 
     def _step_from(self, begin: int, actions: Iterator[Any]) -> int:
-        """Step the copies from ``begin`` on; the first that is still to be stepped, behind one made anew."""
-        slots, plain, shape, checked = self.slots, self._plain, self._shape, self._checked
-        rewards, flat_rows, under_way = slots.rewards, self._flat_rows, slots.under_way
-        has_masks, strict, row = self.has_masks, self.policy.restart, begin
+        """Step from row ``begin`` on; the row to continue from, behind one that was restarted."""
+        # local names: this loop is the cost of every step
+        buffers, plain, shape, checked = self.buffers, self._plain, self._shape, self._checked
+        envs, rewards, flat_rows, current = self.envs, buffers.rewards, self._flat_rows, buffers.current
+        has_masks, strict = self.has_masks, self.policy.restart
+        row = begin
         try:
             for row, action in zip(range(begin, len(self.envs)), actions, strict=False):
-                under_way[0] = row
-                result = self._steps[row](action)
+                current[0] = row
+                result = envs[row].step(action)
                 if not checked:
-                    check_step(result, has_masks)
+                    check_step(result)
+                    check_first_step(result[4], has_masks)
                 observation, reward, terminated, truncated, info = result
                 rewards[row] = reward
                 if strict:
@@ -165,48 +159,80 @@ class EnvGroup:
                 else:
                     self.observation_layout.write(observation, self._rows[row])
                 if strict:
-                    self._check_row(row, self._rows)
+                    self._check_row(self._rows[row], "observation")
                 if has_masks:
                     self._store_mask(row, observation, info)
         except RAISED as error:
-            self._renew(row, error)
+            self._restart(row, error)
             return row + 1
         return len(self.envs)
 
-    def _check_row(self, row: int, rows: list[Inputs], what: str = "observation") -> None:
-        if "flat" in rows[row]:
-            check_finite(what, rows[row]["flat"][0])
+    def _end(self, row: int, observation: Any, terminated: bool) -> tuple[Any, dict[str, Any]]:
+        """Record how the episode ended, keep a truncation's last observation, and reset."""
+        self._dirty = True
+        if terminated:
+            self.buffers.terminated[row] = True
+        else:
+            self.observation_layout.write(observation, self._finals[row])
+            if self.policy.restart:
+                self._check_row(self._finals[row], "final observation")
+            self.buffers.truncated[row] = True
+        observation, info = self.envs[row].reset()
+        return observation, info
 
-    def _renew(self, row: int, error: BaseException) -> None:
-        """Make a copy anew after a fault, as often as the policy allows; else raise what happened.
+    @staticmethod
+    def _check_row(inputs: Inputs, what: str) -> None:
+        if "flat" in inputs:
+            check_finite(what, inputs["flat"][0])
 
-        The step in which it failed did not take place (``slots.cut``), unless only the reset after it failed.
+    # ------------------------------------------------------------------------------------------------- masks
+
+    def _find_mask(self, row: int, info: dict[str, Any]) -> None:
+        source = find_source(self.envs[row], info, self.observation_layout, self.action_layout)
+        self._mask_sources[row] = source
+        self.has_masks = source.kind != "none"
+        if source.kind != self._mask_sources[0].kind:
+            raise ApiBreak(
+                f"this copy's action masks come from {source.kind!r}, copy 0's from "
+                f"{self._mask_sources[0].kind!r}"
+            )
+
+    def _store_mask(self, row: int, observation: Any, info: dict[str, Any]) -> None:
+        mask = self._mask_sources[row].read(observation, info)
+        self.buffers.masks[row] = self.action_layout.flatten_mask(mask, 1)
+
+    def _check_masks(self) -> None:
+        while self.has_masks and len(blocked := self.action_layout.blocked_rows(self.buffers.masks)):
+            self._restart(int(blocked[0]), ApiBreak(NOTHING_ALLOWED))
+
+    # ------------------------------------------------------------------------------------------------ faults
+
+    def _restart(self, row: int, error: BaseException) -> None:
+        """Restart an environment after a fault, as often as the policy allows; else raise the fault.
+
+        The step in which it failed did not take place (``buffers.cut``), unless only the reset after it
+        failed.
         """
         fault = self._fault(row, error)
         if not (self.policy.restart and self.makers):
             raise fault from error
-        slots = self.slots
-        whole = bool(slots.terminated[row] or slots.truncated[row])
-        while True:
-            if self.renewed >= self.policy.max_restarts:
-                raise given_up(fault, self.renewed) from error
-            self.renewed += 1
-            slots.renewals[row] += 1
-            often = int(slots.renewals[row])
-            time.sleep(pause(often, self.policy.timeout))
-            self._seeds[row] = self._seed_of(row)
-            try:
-                self._replace(row)
-                self._begin(row)
-                break
-            except RAISED as again:
-                error, fault = again, self._fault(row, again)
-        if not whole and self._count:
-            slots.cut[row], slots.rewards[row] = True, 0.0
-        self._ended = True
+        buffers = self.buffers
+        complete = bool(buffers.terminated[row] or buffers.truncated[row])
+
+        def attempt() -> None:
+            buffers.restarts[row] += 1
+            wait_before_restart(int(buffers.restarts[row]), self.policy)
+            self._replace(row)
+            self._begin(row)
+
+        self.restarts.until_it_works(fault, attempt, lambda again: self._fault(row, again))
+        if not complete and self._count:
+            buffers.cut[row] = True
+            buffers.rewards[row] = 0.0
+        self._dirty = True
 
     def _replace(self, row: int) -> None:
-        """Another environment in the place of a copy; an instance of the user's own stays and is reset."""
+        """Make another environment for a row; an instance that the user gave stays and is reset."""
         old = self.envs[row]
         fresh: list[gym.Env] = []
         make_all(self.makers[row : row + 1], fresh)
@@ -214,100 +240,52 @@ class EnvGroup:
         if fresh[0] is not old:
             with contextlib.suppress(Exception):
                 old.close()
-        self.envs[row], self._steps[row] = fresh[0], fresh[0].step
+        self.envs[row] = fresh[0]
+
+    def _seed_of(self, row: int) -> int:
+        return seed_of(self._seed, int(self.buffers.restarts[row]), self.first + row)
+
+    def _fault(self, row: int, error: BaseException) -> EnvironmentFault:
+        action = None
+        if self._count:
+            action = action_text(self.action_layout.to_env_single(self.buffers.actions[row]))
+        index = self.first + row
+        return explained(
+            error,
+            f"environment {index} ({self.name})",
+            index,
+            self._count,
+            env_id=self.name,
+            worker=self.worker,
+            seed=self._seed_of(row),
+            action=action,
+        )
+
+    # ------------------------------------------------------------------------------------------------- state
 
     def get_state(self) -> list[Any]:
-        """The packed state of every copy (see states.py)."""
-        return [self._kept(row, states.state_of, env) for row, env in enumerate(self.envs)]
+        """The packed state of every environment (see state.py)."""
+        return [self._state_call(row, states.state_of, env) for row, env in enumerate(self.envs)]
 
     def set_state(self, found: list[Any]) -> None:
-        """Put packed states back into copies that have been reset."""
+        """Put packed states back into environments that have been reset."""
         for row, (env, state) in enumerate(zip(self.envs, found, strict=True)):
-            self._kept(row, states.put_back, env, state)
-            self._seeds[row] = self._seed_of(row)
+            self._state_call(row, states.put_back, env, state)
 
-    def _kept(self, row: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        self.calls += 1
-        self.slots.under_way[0] = row
+    def _state_call(self, row: int, function: Callable[..., Any], *arguments: Any) -> Any:
+        self._calls += 1
+        self.buffers.current[0] = row
         try:
             return function(*arguments)
         except RAISED as error:
-            what = f"the state of environment {self.first + row} ({self.name}) cannot be kept"
-            message = f"{what}: {type(error).__name__}: {error}."
-            facts: dict[str, Any] = {"env_id": self.name, "worker": self.worker}
-            raise EnvironmentFault(message, self.first + row, self._count, **facts) from error
+            index = self.first + row
+            raise EnvironmentFault(
+                f"the state of environment {index} ({self.name}) cannot be kept: {type(error).__name__}: "
+                f"{error}.",
+                index,
+                self._count,
+                env_id=self.name,
+                worker=self.worker,
+            ) from error
         finally:
-            self.slots.under_way[0] = -1
-
-    def _end(self, row: int, observation: Any, terminated: bool) -> tuple[Any, dict[str, Any]]:
-        """Note how the episode ended, keep a truncation's last observation, and reset."""
-        self._ended = True
-        if terminated:
-            self.slots.terminated[row] = True
-        else:
-            self.observation_layout.write(observation, self._final_rows[row])
-            if self.policy.restart:
-                self._check_row(row, self._final_rows, "final observation")
-            self.slots.truncated[row] = True
-        observation, info = self.envs[row].reset()
-        return observation, info
-
-    def _find_mask(self, row: int, observation: Any, info: dict[str, Any]) -> None:
-        """Decide once where this copy's action masks come from."""
-        env, source = self.envs[row], "none"
-        if not self.action_layout.num_logits:
-            pass  # nothing that a mask could forbid
-        elif MASK_KEY in info:
-            source = "info"
-        elif env.has_wrapper_attr("action_masks") and callable(env.get_wrapper_attr("action_masks")):
-            source = "method"
-        elif self.observation_layout.has_mask:
-            source = "observation"
-        self._mask_sources[row] = source
-        self._mask_functions[row] = env.get_wrapper_attr("action_masks") if source == "method" else dict
-        self.has_masks = source != "none"
-        if source != self._mask_sources[0]:
-            raise ApiBreak(
-                f"this copy's action masks come from {source!r}, copy 0's from {self._mask_sources[0]!r}"
-            )
-
-    def _store_mask(self, row: int, observation: Any, info: dict[str, Any]) -> None:
-        source = self._mask_sources[row]
-        if source == "info":
-            if MASK_KEY not in info:
-                raise ApiBreak(
-                    f"info has no {MASK_KEY!r} although reset gave one; give it at every reset and every step"
-                )
-            mask = info[MASK_KEY]
-        else:
-            mask = (
-                self._mask_functions[row]()
-                if source == "method"
-                else self.observation_layout.mask_of(observation)
-            )
-        self.slots.masks[row] = self.action_layout.flatten_mask(mask, 1)
-
-    def _check_masks(self) -> None:
-        while len(blocked := self.action_layout.blocked_rows(self.slots.masks)):
-            self._renew(int(blocked[0]), ApiBreak("the action mask forbids every choice; allow at least one"))
-
-    def _fault(self, row: int, error: BaseException) -> EnvironmentFault:
-        """The error of one copy in words; an environment's own exception brings its traceback along."""
-        index, seed = self.first + row, self._seeds[row]
-        action = action_text(_nth(self.action_layout.rows(self.slots.actions), row)) if self._count else None
-        where = f"environment {index} ({self.name}) at step {self._count}"
-        if isinstance(error, Overdue):
-            what = f" was {error}"
-        elif isinstance(error, ApiBreak) or raised_here(error):
-            what = f" does not follow Gymnasium's API: {error}"
-        else:
-            what = f" raised {type(error).__name__}: {error}"
-        message = where + what + circumstances(self.worker, seed, action)
-        if not isinstance(error, ApiBreak):
-            message += "\n" + "".join(traceback.format_exception(error)).rstrip()
-        facts: dict[str, Any] = {"env_id": self.name, "worker": self.worker, "seed": seed, "action": action}
-        return EnvironmentFault(message, index, self._count, **facts)
-
-
-def _nth(items: Iterator[Any], index: int) -> Any:
-    return next(itertools.islice(items, index, None))
+            self.buffers.current[0] = -1

@@ -1,7 +1,7 @@
-"""Worker processes that step some copies of an environment each.
+"""Worker processes, seen from the main process, and the channel between the two.
 
-Arrays are shared memory; a socket carries only fixed-size wake-ups and, when something breaks, an error as
-JSON text.
+Arrays are shared memory. A socket carries fixed-size commands and replies, and JSON text for the states of
+environments and for a fault.
 """
 
 from __future__ import annotations
@@ -11,36 +11,27 @@ import json
 import math
 import multiprocessing
 import os
-import signal
 import socket
 import struct
 import sys
-import threading
 import time
-import traceback
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from multiprocessing.context import BaseContext
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from tightrope.control.environments import state as states
-from tightrope.control.environments.faults import RAISED, EnvironmentFault, FaultPolicy
-from tightrope.control.environments.group import EnvGroup
-from tightrope.control.environments.step import Slots
-from tightrope.control.environments.tasks import make_all
+from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy
 
-# what to do (r = reset, s = step, g = give states, p = put back states, c = close) and a number: the seed of
-# a reset, or the length of the states that follow
-COMMAND = struct.Struct("<cq")
-LENGTH = struct.Struct("<I")
-READY, MASKED, BROKEN = b"k", b"m", b"e"  # replies: fine, fine and there are action masks, JSON follows
-TO_BUILD = 60.0  # seconds at least to make the copies, which may import much; then env_timeout is the limit
-SPIN = 2e-4  # seconds to look for a message before sleeping; to wake a sleeper costs about as much as a step
+COMMAND = struct.Struct("<cq")  # one of the following, and a number: a seed, or how many bytes of data follow
+RESET, STEP, GET_STATE, SET_STATE, CLOSE = b"r", b"s", b"g", b"p", b"c"
+LENGTH = struct.Struct("<Q")
+READY, MASKED, BROKEN = b"k", b"m", b"e"  # replies: done; done, and there are action masks; a fault follows
+TO_BUILD = 60.0  # seconds at least to make the environments, which may import much
+SPIN = 2e-4  # seconds to poll for a message before sleeping; waking a sleeper costs about as much as a step
 
 _yield_core: Callable[[], Any] = getattr(os, "sched_yield", int)  # int() where there is nothing to call
 _parent_ends: weakref.WeakSet[socket.socket] = weakref.WeakSet()
@@ -77,50 +68,56 @@ def start_context() -> BaseContext:
 
 
 class Worker:
-    """This process's end of one worker."""
+    """The main process's end of one worker process, which runs ``serve`` (see pool.py)."""
 
     def __init__(
         self,
         context: BaseContext,
-        makers: Sequence[Callable[[], gym.Env]],
-        slots: Slots | None,
+        serve: Callable[..., None],
+        makers: Sequence[Callable[[], Any]],
+        shared: Any,
         first: int,
         number: int,
         name: str,
         spin: float,
         policy: FaultPolicy,
     ) -> None:
-        self.first, self.number, self.name, self._spin = first, number, name, spin
+        self.first = first
+        self.number = number
+        self.name = name
+        self._spin = spin
+        self._timeout = policy.timeout
+        self._built = False
         self._socket, theirs = socket.socketpair()
-        self._timeout, self._built = policy.timeout, False
-        self._be_patient(None if policy.timeout is None else max(TO_BUILD, policy.timeout))
+        self._set_patience(None if policy.timeout is None else max(TO_BUILD, policy.timeout))
         carried = CloudpickleWrapper(list(makers))  # type: ignore[arg-type]
-        arguments = (theirs, carried, slots, first, number, name, spin, policy)
         self._process = context.Process(  # type: ignore[attr-defined]
-            target=_work, args=arguments, daemon=True, name=f"tightrope-worker-{first}"
+            target=serve,
+            args=(theirs, carried, shared, first, number, name, spin, policy),
+            daemon=True,
+            name=f"tightrope-worker-{first}",
         )
         _parent_ends.add(self._socket)
-        with (
-            warnings.catch_warnings()
-        ):  # Python 3.12 warns of fork beside threads; start_context says why it is safe
+        with warnings.catch_warnings():
+            # Python 3.12 warns of fork beside threads; start_context explains why it is safe here
             warnings.filterwarnings("ignore", message=".*multi-threaded.*fork", category=DeprecationWarning)
             self._process.start()
         theirs.close()
 
-    def tell(self, command: bytes, seed: int = 0, data: bytes = b"") -> None:
-        """Wake the worker; that it is gone shows when it is waited for."""
+    def send(self, command: bytes, number: int = 0, data: bytes = b"") -> None:
+        """Wake the worker; `wait` finds out if it is gone."""
         with contextlib.suppress(OSError):
-            self._socket.sendall(COMMAND.pack(command, seed) + data)
+            self._socket.sendall(COMMAND.pack(command, number) + data)
 
     def wait(self) -> bool:
-        """Until the worker has finished; True when its copies give action masks. EnvironmentFault: its
-        error.
+        """Wait for the reply; True when the environments give action masks.
+
+        EnvironmentFault: the worker's, or the worker is gone.
         """
         try:
-            reply = _receive_soon(self._socket, 1, self._spin)
+            reply = receive_soon(self._socket, 1, self._spin)
             if reply == BROKEN:
-                (length,) = LENGTH.unpack(self._receive(LENGTH.size))
-                raise EnvironmentFault(**json.loads(self._receive(length).decode()))
+                raise EnvironmentFault(**self._receive_json())
         except (TimeoutError, BlockingIOError) as error:
             self._process.kill()
             what = f"has not answered for {self._patience:g} s (env_timeout); is the environment stuck?"
@@ -131,22 +128,19 @@ class Worker:
             raise self._lost("has died")
         if not self._built:
             self._built = True
-            self._be_patient(self._timeout)
+            self._set_patience(self._timeout)
         return reply == MASKED
 
-    def data(self) -> Any:
-        """What follows the reply of a worker that was asked for its states. EnvironmentFault as `wait`."""
+    def states(self) -> Any:
+        """The packed states that follow the reply to GET_STATE. EnvironmentFault as `wait`."""
         try:
-            (length,) = states.LENGTH.unpack(self._receive(states.LENGTH.size))
-            return json.loads(self._receive(length))
+            return self._receive_json()
         except OSError as error:
             self._process.kill()
-            raise self._lost("has died amid its answer") from error
+            raise self._lost("died while it answered") from error
 
-    def _be_patient(self, seconds: float | None) -> None:
-        """Let a blocking ``recv`` give up after ``seconds``: the kernel's own timeout, one system call less
-        than Python's.
-        """
+    def _set_patience(self, seconds: float | None) -> None:
+        """Let a blocking ``recv`` give up after ``seconds``; the kernel's timeout costs one call less."""
         self._patience = seconds or 0.0
         if hasattr(socket, "MSG_DONTWAIT"):
             whole, part = divmod(seconds or 0.0, 1.0)  # 0: never
@@ -155,14 +149,12 @@ class Worker:
         else:
             self._socket.settimeout(seconds)
 
-    def _receive(self, length: int) -> bytes:
-        data = b""
-        while len(data) < length:
-            part = self._socket.recv(length - len(data))
-            if not part:
-                raise self._lost("has died")
-            data += part
-        return data
+    def _receive_json(self) -> Any:
+        try:
+            (length,) = LENGTH.unpack(receive_all(self._socket, LENGTH.size))
+            return json.loads(receive_all(self._socket, length))
+        except EOFError as error:
+            raise self._lost("has died") from error
 
     def _lost(self, what: str) -> EnvironmentFault:
         self._process.join(1.0)
@@ -176,13 +168,8 @@ class Worker:
             lost=True,
         )
 
-    def ask_to_stop(self) -> None:
-        """The first half of stopping, so that several workers close side by side."""
-        with contextlib.suppress(OSError):
-            self._socket.sendall(COMMAND.pack(b"c", 0))
-
     def stop(self, patience: float = 2.0) -> None:
-        """Wait so many seconds for the worker to end, and end it when it does not."""
+        """Wait for the worker to end, and kill it after ``patience`` seconds."""
         self._process.join(patience)
         if self._process.is_alive():
             self._process.kill()
@@ -191,97 +178,35 @@ class Worker:
         self._process.close()
 
 
-def _receive_soon(channel: socket.socket, length: int, spin: float) -> bytes:
-    """``recv`` of a whole message that is likely to come within ``spin`` seconds."""
+def pack_json(value: Any) -> bytes:
+    """A value as JSON text behind its length, as `Worker` reads it."""
+    data = json.dumps(value, allow_nan=False).encode()
+    return LENGTH.pack(len(data)) + data
+
+
+def receive_all(channel: socket.socket, length: int) -> bytes:
+    """Exactly ``length`` bytes. EOFError: the other end is gone."""
+    data = b""
+    while len(data) < length:
+        part = channel.recv(length - len(data))
+        if not part:
+            raise EOFError("the other process is gone")
+        data += part
+    return data
+
+
+def receive_soon(channel: socket.socket, length: int, spin: float) -> bytes:
+    """A whole message that is likely to come within ``spin`` seconds; empty when the other end is gone."""
     if spin and hasattr(socket, "MSG_DONTWAIT"):
         give_up = time.perf_counter() + spin
         while time.perf_counter() < give_up:
             with contextlib.suppress(BlockingIOError):
                 return channel.recv(length, socket.MSG_DONTWAIT)
-            _yield_core()  # to whoever has work: without it a busy machine is slowed down twofold
+            _yield_core()  # without it a busy machine runs at half its speed
     return channel.recv(length, socket.MSG_WAITALL)
 
 
-def _work(
-    channel: socket.socket,
-    makers: Any,
-    shared: Slots,
-    first: int,
-    number: int,
-    name: str,
-    spin: float,
-    policy: FaultPolicy,
-) -> None:
-    """The life of a worker: make the copies, then reset and step them as told until told to stop or left
-    alone.
-    """
-    # Ctrl-C reaches the whole process group; the parent ends its workers in order.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not the parent's answer, which a fork brings along
-    for inherited in list(
-        _parent_ends
-    ):  # else this process would keep other workers from seeing their parent die
+def close_inherited() -> None:
+    """In a forked worker: close the main process's ends, which would hide the main process's death."""
+    for inherited in list(_parent_ends):
         inherited.close()
-    threading.Thread(target=_outlive_nobody, args=(os.getppid(),), daemon=True).start()
-    envs: list[gym.Env] = []
-    try:
-        make_all(makers.fn, envs)
-        slots = shared.map(SharedArray.view).map(lambda array: array[first : first + len(envs)])
-        group = EnvGroup(envs, slots, name, first, makers=makers.fn, policy=policy, worker=number)
-        envs = group.envs
-        check_slots(group, slots)
-        channel.sendall(READY)
-        while (more := _obey(channel, group, spin)) is not None:
-            channel.sendall((MASKED if group.has_masks else READY) + more)
-    except (ConnectionError, EOFError):
-        pass  # the parent is gone
-    except RAISED as error:
-        text = f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
-        failed = EnvironmentFault(
-            f"making copies of {name} in a worker failed: {text}", first, env_id=name, worker=number
-        )
-        fault = error if isinstance(error, EnvironmentFault) else failed
-        data = json.dumps(fault.record()).encode()
-        with contextlib.suppress(OSError):
-            channel.sendall(BROKEN + LENGTH.pack(len(data)) + data)
-    finally:
-        for env in envs:
-            with contextlib.suppress(Exception):
-                env.close()
-        channel.close()
-
-
-def _outlive_nobody(parent: int) -> None:
-    """End this process soon after its parent, even while an environment hangs."""
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
-
-
-def _obey(channel: socket.socket, group: EnvGroup, spin: float) -> bytes | None:
-    """Wait for one command and carry it out; what to send behind the reply, None when it is time to stop."""
-    message = _receive_soon(channel, COMMAND.size, spin)
-    command, number = COMMAND.unpack(message) if len(message) == COMMAND.size else (b"c", 0)
-    if command == b"r":
-        group.reset(number)
-    elif command == b"s":
-        group.step()
-    elif command == b"p":
-        states.taken(channel, group, number)
-    elif command == b"g":
-        return states.told(group)
-    return None if command == b"c" else b""
-
-
-def check_slots(group: EnvGroup, slots: Slots) -> None:
-    """ValueError when a worker's copies do not fit the arrays that the first group's spaces laid out."""
-    theirs = {name: array.shape[1:] for name, array in slots.inputs.items()}
-    ours = {name: array.shape[1:] for name, array in group.observation_layout.allocate(0).items()}
-    layout = group.action_layout
-    if theirs != ours or (layout.num_columns, layout.num_logits) != (
-        slots.actions.shape[1],
-        slots.masks.shape[1],
-    ):
-        raise ValueError(
-            f"the copies differ: {group.envs[0].observation_space}, {layout.space}; expected {theirs}."
-        )

@@ -1,7 +1,7 @@
 """The state of environments that can give it, as JSON; nothing is pickled.
 
 An environment takes part by two methods: ``get_state()`` returns what it is in the middle of, made of None,
-numbers, strings, bytes, lists, dicts with string keys and numpy arrays; ``set_state(state)`` goes on from
+numbers, strings, bytes, lists, dicts with string keys and numpy arrays; ``set_state(state)`` continues from
 there. Its generator ``np_random`` and Gymnasium's time limit are kept for it. A wrapper in between that has
 a state of its own needs the two methods itself, and then speaks for everything inside it.
 """
@@ -9,12 +9,7 @@ a state of its own needs the two methods itself, and then speaks for everything 
 from __future__ import annotations
 
 import base64
-import itertools
-import json
 import math
-import socket
-import struct
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -25,7 +20,6 @@ KINDS = "biufc"  # of arrays: bool, int, unsigned, float, complex
 ARRAY, BYTES, NUMBER = "array", "bytes", "number"
 # the methods by which an environment gives and takes its state
 GET, SET = "get_state", "set_state"
-LENGTH = struct.Struct("<Q")
 
 
 def pack(value: Any, place: str = "state") -> Any:
@@ -134,47 +128,3 @@ def put_back(env: Any, packed: Any) -> None:
         limit._elapsed_steps = elapsed
     if "rng" in state:
         env.unwrapped.np_random.bit_generator.state = state["rng"]
-
-
-# ------------------------------------------------------------------------------- copies, here and in workers
-
-
-def of_copies(own: Any, workers: Sequence[Any]) -> list[Any]:
-    """The packed states of the copies of this process (None: it has none) and of its workers, in order;
-    EnvironmentFault names one that cannot.
-    """
-    for worker in workers:
-        worker.tell(b"g")
-    found = [] if own is None else own.get_state()
-    for worker in workers:
-        worker.wait()
-        found += worker.data()
-    return found
-
-
-def into_copies(found: list[Any], own: Any, workers: Sequence[Any]) -> None:
-    """Give every copy, which has been reset, its state of `of_copies`."""
-    bounds = [worker.first for worker in workers] + [len(found)]
-    if own is not None:
-        own.set_state(found[: bounds[0]])
-    for worker, (begin, end) in zip(workers, itertools.pairwise(bounds), strict=True):
-        data = json.dumps(found[begin:end], allow_nan=False).encode()
-        worker.tell(b"p", len(data), data)
-        worker.wait()
-
-
-def taken(channel: socket.socket, group: Any, length: int) -> None:
-    """A worker's part of `into_copies`: ``length`` bytes of states for its group."""
-    data = b""
-    while len(data) < length:
-        part = channel.recv(length - len(data))
-        if not part:
-            raise EOFError("the parent is gone")
-        data += part
-    group.set_state(json.loads(data))
-
-
-def told(group: Any) -> bytes:
-    """A worker's part of `of_copies`: the states of its group, to be sent after its reply."""
-    data = json.dumps(group.get_state(), allow_nan=False).encode()
-    return LENGTH.pack(len(data)) + data

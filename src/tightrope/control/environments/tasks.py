@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from tightrope.control.spaces.observations import (
+from tightrope.control.spaces import (
     ActionLayout,
     ObservationLayout,
     action_layout,
@@ -34,16 +34,12 @@ NOISE = (
     r".*settotalmass.*",
     r"builtin type [Ss]wig\w* has no __module__ attribute",
 )
-BOOKKEEPING = (
-    "OrderEnforcing",
-    "PassiveEnvChecker",
-)  # wrappers that gym.make adds or not, without effect on a task
+# wrappers that gym.make adds or not, without effect on a task
+BOOKKEEPING = ("OrderEnforcing", "PassiveEnvChecker")
 
 
 def find_spec(env_id: str) -> EnvSpec | None:
-    """The registered spec of an id, Atari included; None when there is none (yet: "module:Id" imports
-    first).
-    """
+    """The registered spec of an id, Atari included; None without one (yet: "module:Id" imports first)."""
     register_atari(env_id)
     return gym.registry.get(env_id.rpartition(":")[2])
 
@@ -78,9 +74,7 @@ def quiet(spec: EnvSpec | None = None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _mujoco_warnings() -> Iterator[None]:
-    """MuJoCo prints from C and writes MUJOCO_LOG.TXT into the working folder; make it Python warnings
-    instead.
-    """
+    """Turn what MuJoCo prints from C, and writes to MUJOCO_LOG.TXT, into Python warnings."""
     try:
         import mujoco
     except ImportError:
@@ -95,16 +89,12 @@ def _mujoco_warnings() -> Iterator[None]:
 
 
 def make_by_id(env_id: str, **keywords: Any) -> gym.Env:
-    """``gym.make`` with helpful errors; its passive checker is replaced by our own look at the first
-    steps.
-    """
+    """``gym.make`` with helpful errors; checks of the first steps replace its passive checker."""
     return _explained(env_id, lambda: gym.make(env_id, disable_env_checker=True, **keywords))
 
 
 def make_vector_by_id(env_id: str, num_envs: int) -> Any:
-    """The task's own vector version, resetting in the same step where it can; ValueError when there is
-    none.
-    """
+    """The task's own vector version, resetting in the same step where it can; ValueError without one."""
     spec = find_spec(env_id)
     if spec is None:
         make_by_id(env_id).close()  # raises for an unknown id; "module:Id" registers itself
@@ -167,9 +157,7 @@ def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int) -> Any
 
 
 def _explained(env_id: str, make: Callable[[], Any]) -> Any:
-    """What ``make`` gives; errors about the id or a missing package become a ValueError that says what to
-    do.
-    """
+    """What ``make`` returns; errors about the id or a missing package become a ValueError with advice."""
     spec = find_spec(env_id)
     try:
         with quiet(spec):
@@ -212,8 +200,9 @@ def _did_you_mean(name: str, known: Any) -> str:
 
 
 def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env]) -> None:
-    """Append one environment per maker to ``envs``; ValueError when a maker gives something else or one
-    twice.
+    """Append one environment per maker to ``envs``.
+
+    ValueError when a maker returns something else, or the same object twice.
     """
     for maker in makers:
         env = maker()

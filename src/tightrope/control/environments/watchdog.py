@@ -1,10 +1,10 @@
 """A time limit for environments of this process: free while they answer, an exception when they hang.
 
-A thread looks now and then whether the call under way is still the one of last time. One that takes too long
-is interrupted by a signal whose handler raises in the main thread, where the environment is. This works
+A thread checks now and then whether the call under way is still the same. One that takes too long is
+interrupted by a signal whose handler raises in the main thread, where the environment is. This works
 wherever Python can be interrupted: sleeping, waiting, computing in Python. Compiled code that never comes
 back cannot be stopped from inside its process; then a line on stderr names it. Other processes have a limit
-of their own (workers.py).
+of their own (processes.py).
 """
 
 from __future__ import annotations
@@ -64,16 +64,16 @@ class Watchdog:
             signal.signal(SIGNAL, signal.SIG_DFL)
 
     def _watch(self) -> None:
-        seen, since, told = None, time.monotonic(), False
+        seen, since, reported = None, time.monotonic(), False
         while not self._over.wait(min(1.0, self._timeout / 4)):
             if self._under_way() is None:
                 _watching.remove(self)
                 return
             now, clock = self._now(), time.monotonic()
             if now is None or now != seen:
-                seen, since, told = now, clock, False
-            elif clock - since >= 2 * self._timeout and not told:
-                told = True
+                seen, since, reported = now, clock, False
+            elif clock - since >= 2 * self._timeout and not reported:
+                reported = True
                 print(
                     f"{self._name} has not answered for {clock - since:.0f} s and cannot be interrupted: it "
                     "is in compiled code of this process, or swallows what interrupts it. End the process; "

@@ -1,5 +1,4 @@
-"""From the actor's outputs to a distribution over actions: the one place that samplers and trainers both
-call.
+"""From the actor's outputs to a distribution over actions, for sampling and for training.
 
 An action is a row of ``num_columns`` float32 numbers: category indices, bits and Gaussian values side by
 side. Noise comes from outside (uniforms for categories and bits, standard normals for Gaussian columns), so
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tightrope.control.spaces.observations import ActionLayout, Component
+from tightrope.control.spaces import ActionLayout, Component
 from tightrope.maths import divergence
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -65,9 +64,7 @@ class Distribution:
         return torch.cat(parts, dim=1)
 
     def logp(self, actions: Tensor) -> Tensor:
-        """log pi(a) [N] of actions [N, A]; squashed: the density of the action in the environment's own
-        units.
-        """
+        """log pi(a) [N] of actions [N, A]; squashed: the density in the environment's units."""
         total = torch.zeros(len(actions), device=actions.device)
         for component in self.layout.components:
             x = actions[:, component.column : component.column + component.width]

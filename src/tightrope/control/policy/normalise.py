@@ -1,6 +1,4 @@
-"""Running statistics of observations and rewards: frozen during a rollout and its update, moved between
-them.
-"""
+"""Running statistics of observations and rewards: frozen during a rollout and its update, moved after it."""
 
 from __future__ import annotations
 
@@ -81,7 +79,7 @@ class RewardNormaliser:
         self.moments = self.moments.update(torch.from_numpy(series[mask][:, None]))
 
     def restart(self, num_envs: int) -> None:
-        """Episodes begin anew: another environment, or a resumed run."""
+        """New episodes begin: another environment, or a resumed run."""
         self.running = np.zeros(num_envs)
 
     def state(self) -> dict[str, torch.Tensor]:
@@ -112,6 +110,12 @@ class Normalisers:
         if self.observations is None or "flat" not in inputs:
             return inputs
         return {**inputs, "flat": self.observations(inputs["flat"])}
+
+    def start(self, rollout: Any) -> None:
+        """Give the reward normaliser its first statistics: the first rollout is scaled by its own."""
+        if self.rewards is not None and float(self.rewards.moments.count) == 0:
+            self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
+            rollout.reward_statistics_taken = True
 
     def update(self, rollout: Any) -> None:
         """Move the statistics, after the update on this rollout."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.control.policy.distributions import Distribution, gaussian_dimensions
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces.observations import ActionLayout, ObservationLayout
+from tightrope.control.spaces import ActionLayout, ObservationLayout
 
 Inputs = dict[str, Tensor]
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}

@@ -1,7 +1,4 @@
-"""Rollouts: step the environments with the policy, and turn what came back into a Batch to learn from.
-
-Memory is environment-major, [B, T, ...], allocated once and filled in place.
-"""
+"""Collecting rollouts: step the environments with the policy."""
 
 from __future__ import annotations
 
@@ -9,92 +6,43 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import torch
 
-from tightrope.algorithms.batch import Batch
-from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
-from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
+from tightrope.control.engine.base import Engine
 from tightrope.control.environments import state as states
-from tightrope.control.environments.faults import action_text, circumstances
-from tightrope.control.environments.make import Environments
+from tightrope.control.environments.base import Environments
 from tightrope.control.policy.normalise import Normalisers
-
-Array = np.ndarray
+from tightrope.control.rollout.rollout import Array, Rollout, check_numbers, check_policy
+from tightrope.control.spaces import Inputs
 
 
 def reset_seed(seed: int, step: int) -> int:
-    """The seed of a reset at an agent step; copy i of single environments adds i. At 0 the run's own."""
+    """The seed of a reset at an agent step; at step 0 the run's own. Single environment i adds i."""
     if step == 0:
         return seed
     return int(np.random.SeedSequence([seed, step]).generate_state(1)[0]) >> 2  # with i it fits 31 bits
 
 
-class BadNumbers(ValueError):
-    """An environment returned a NaN or an infinity; nothing was learned from it."""
-
-
-class Rollout:
-    """What happened in T steps of B environments. ``mask`` False: NEXT_STEP's reset row, not a transition.
-    With ``ended`` beside it: the step in which an environment failed and was made anew. Its input is the last
-    observation of the episode that was cut, from whose value the step before it is bootstrapped.
-
-    ``inputs``: what the policy saw (normalised), ``raw``: flat observations as they came, ``rewards``: as
-    they came. ``last``: encoded observation after the last step; ``finals``: (column, rows, encoded true
-    final observations) of truncated episodes whose next row already belongs to a new episode.
-    """
-
-    def __init__(self, environments: Environments, num_steps: int, *, keep_raw: bool) -> None:
-        rows, layout, actions = (
-            environments.num_envs,
-            environments.observation_layout,
-            environments.action_layout,
-        )
-        shape = (rows, num_steps)
-        self.inputs: dict[str, Array] = {}
-        if layout.size:
-            self.inputs["flat"] = np.zeros((*shape, layout.size), np.float32)
-        for i, image in enumerate(layout.image_shapes):
-            self.inputs[f"image{i}"] = np.zeros((*shape, *image), np.uint8)
-        self.raw = (
-            np.zeros_like(self.inputs["flat"]) if keep_raw else self.inputs.get("flat", np.zeros((*shape, 0)))
-        )
-        self.actions = np.zeros((*shape, actions.num_columns), np.float32)
-        self.logp = np.zeros(shape, np.float32)
-        self.rewards = np.zeros(shape, np.float64)
-        self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
-        self.mask = np.ones(shape, bool)
-        self.ended = np.zeros(shape, bool)
-        self.last: dict[str, Array] = {}
-        self.finals: list[tuple[int, Array, dict[str, Array]]] = []
-        self.episodes: list[tuple[float, int, bool]] = []
-        self.reward_statistics_taken = False
-        self.env_seconds = 0.0
-        self.restarts: int | None = None  # environments made anew; None: the settings do not allow it
-
-    @property
-    def steps(self) -> int:
-        """How many transitions there are."""
-        return int(self.mask.sum())
-
-
 class Collector:
-    """Fills rollouts; carries observations, and the return and length of running episodes, from one to the
-    next.
-    """
+    """Fills rollouts; carries observations and running episodes from one to the next."""
 
     def __init__(
         self, environments: Environments, normalisers: Normalisers, rng: np.random.Generator
     ) -> None:
-        self.environments, self.normalisers, self.rng = environments, normalisers, rng
+        self.environments = environments
+        self.normalisers = normalisers
+        self.rng = rng
         self._rollout: Rollout | None = None
-        self._uniform = np.concatenate(
+        self._uniform = np.concatenate(  # bool [A]: columns whose noise is uniform, not normal
             [np.full(c.width, c.kind != "gaussian") for c in environments.action_layout.components]
         )
-        self._step_count, self._restarts = 0, 0
+        self._step_count = 0
+        self._column = 0  # the step of the rollout that is under way
+        self._restarts = 0  # those that earlier rollouts reported
 
     def reset(self, seed: int, step: int = 0) -> None:
-        """Begin all episodes anew at an agent step, with seeds of (seed, step) alone; those that were running
-        are cut: their last step was bootstrapped, and they are not counted.
+        """Start new episodes at an agent step, with seeds that depend only on (seed, step).
+
+        Those that were running are cut: their last step was bootstrapped, and they are not counted.
         """
         self._inputs, self._action_mask = self.environments.reset(reset_seed(seed, step))
         self._returns = np.zeros(self.environments.num_envs)
@@ -107,13 +55,13 @@ class Collector:
         if not self.environments.gives_state:
             return None
         names = ("_inputs", "_action_mask", "_returns", "_lengths")
-        own = {name: states.pack(getattr(self, name)) for name in names}
-        return {**own, "environments": self.environments.get_state()}
+        episodes = {name: states.pack(getattr(self, name)) for name in names}
+        return {**episodes, "environments": self.environments.get_state()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on with the episodes of a `state`. ValueError for one of other environments."""
+        """Continue the episodes of a `state`. ValueError for one of other environments."""
         restarts = self.environments.restarts
-        self.environments.count_from(0)  # the resets of then, and what failed in them, come once more
+        self.environments.count_from(0)  # the reset repeats the restarts of the first time
         inputs, action_mask = self.environments.set_state(state["environments"])
         self.environments.count_from(restarts)
         zeros = np.zeros(self.environments.num_envs)
@@ -125,7 +73,7 @@ class Collector:
             setattr(self, name, found)
 
     def count_from(self, restarts: int) -> None:
-        """So many environments were made anew before; the rows so far have told of them."""
+        """Start the restart counter here; earlier rows already reported these."""
         self.environments.count_from(restarts)
         self._restarts = restarts
 
@@ -141,121 +89,90 @@ class Collector:
             )
         return noise
 
-    def collect(self, engine: Any, num_steps: int) -> Rollout:
-        """Step all environments ``num_steps`` times with the engine's policy; the memory is reused by the
-        next call.
+    def collect(self, engine: Engine, num_steps: int) -> Rollout:
+        """Step all environments ``num_steps`` times with the engine's policy.
+
+        The next call reuses the arrays of the rollout that it returns. The first rollout of all also starts
+        the reward normaliser, which has nothing else to scale it by.
         """
-        keep_raw = self.normalisers.observations is not None
-        rollout = self._rollout
-        if rollout is None or rollout.logp.shape[1] != num_steps:
-            rollout = self._rollout = Rollout(self.environments, num_steps, keep_raw=keep_raw)
-            if self._action_mask is not None:
-                shape = (*rollout.logp.shape, self._action_mask.shape[1])
-                rollout.inputs["action_mask"] = np.ones(shape, bool)
-        rollout.mask.fill(True)
-        rollout.ended.fill(False)
-        rollout.finals, rollout.reward_statistics_taken = [], False
-        noise = self.noise(num_steps, self.environments.num_envs, self.rng)
-        engine.begin_rollout(self.environments.num_envs, self.rng)
-        waves = self.environments.waves
-        inputs, action_mask, t, env_seconds = self._inputs, self._action_mask, 0, 0.0
+        rollout = self._cleared(num_steps)
         try:
-            for t in range(num_steps):
-                if action_mask is not None:
-                    rollout.inputs["action_mask"][:, t] = action_mask
-                if keep_raw:
-                    rollout.raw[:, t] = inputs["flat"]
-                for rows in waves:
-                    engine.act(inputs, self.normalisers.observations, action_mask, noise[t], rollout, rows, t)
-                    self.environments.begin(rows, rollout.actions[rows, t])
-                before = perf_counter()
-                step = self.environments.finish()
-                env_seconds += perf_counter() - before
-                inputs, action_mask = step.inputs, step.action_mask
-                rollout.rewards[:, t] = step.rewards
-                rollout.terminated[:, t] = step.terminated
-                rollout.truncated[:, t] = step.truncated
-                if step.phantom is not None:
-                    np.logical_not(step.phantom, out=rollout.mask[:, t])
-                if step.cut is not None:
-                    rollout.mask[step.cut, t], rollout.ended[step.cut, t] = False, True
-                if step.final_rows is not None and step.final_inputs is not None:
-                    rollout.finals.append((t, step.final_rows, step.final_inputs))
+            inputs = self._fill(rollout, engine)
         except Exception:
             # a NaN observation or a NaN weight is the likelier cause of what failed after it
-            self._check_numbers(rollout, t + 1)
-            self._check_policy(rollout, t + 1, engine)
+            self._check(rollout, engine, self._column + 1, self._inputs)
             raise
-        self._inputs, self._action_mask, rollout.env_seconds = inputs, action_mask, env_seconds
-        self._check_numbers(rollout, num_steps)
-        self._check_policy(rollout, num_steps, engine)
+        self._inputs = inputs
+        self._check(rollout, engine, num_steps, inputs)
         rollout.last = self.normalisers.encode(inputs)
         rollout.finals = [(t, rows, self.normalisers.encode(x)) for t, rows, x in rollout.finals]
         rollout.ended |= rollout.terminated | rollout.truncated
-        if self.environments.restartable:
+        if self.environments.policy.restart:
             rollout.restarts = self.environments.restarts - self._restarts
             self._restarts = self.environments.restarts
         rollout.episodes = self._count_episodes(rollout)
         self._step_count += num_steps
+        self.normalisers.start(rollout)
         return rollout
 
-    def _check_numbers(self, rollout: Rollout, num_steps: int) -> None:
-        """Raise BadNumbers naming environment, step and index of the first NaN or infinity, if there is
-        one.
-        """
-        rows, start = np.arange(len(rollout.logp)), self._step_count
-        checks = [("observation", rollout.raw[:, :num_steps], rows, start, -1)]
-        checks += [("reward", rollout.rewards[:, :num_steps, None], rows, start, 0)]
-        if "flat" in self._inputs:
-            last = self._inputs["flat"][:, None]
-            checks.append(("observation", last, rows, start + num_steps, num_steps - 1))
-        for t, final_rows, x in rollout.finals:
-            if "flat" in x:
-                checks.append(("final observation", x["flat"][:, None], final_rows, start + t + 1, t))
-        for what, numbers, which, first, column in checks:  # ``column``: of the action that led there
-            good = np.isfinite(numbers)
-            if good.all():
-                continue
-            row, t, index = np.argwhere(~good)[0]
-            where = f"step {first + t}" + ("" if what == "reward" else f", index {index}")
-            raise BadNumbers(
-                f"Environment {which[row]} of {self.environments.spec_id} returned "
-                f"{what} = {numbers[row, t, index]} at {where}"
-                f"{self._circumstances(rollout, int(which[row]), int(column + t))}; expected finite "
-                "numbers. The policy was not updated with it. Mend the environment, or clip and check its "
-                "state there; --on-env-fault restart makes it anew and goes on."
-            )
+    def _cleared(self, num_steps: int) -> Rollout:
+        rollout = self._rollout
+        if rollout is None or rollout.logp.shape[1] != num_steps:
+            keep_raw = self.normalisers.observations is not None
+            has_masks = self._action_mask is not None
+            rollout = Rollout(self.environments, num_steps, keep_raw=keep_raw, has_masks=has_masks)
+            self._rollout = rollout
+        rollout.clear()
+        return rollout
 
-    def _check_policy(self, rollout: Rollout, num_steps: int, engine: Any) -> None:
-        """NonFiniteError when the policy gave a log-probability that is not finite; a bad weight is named."""
-        bad = ~np.isfinite(rollout.logp[:, :num_steps])
-        if not bad.any():
-            return
-        row, t = np.argwhere(bad)[0]
-        weight = first_bad((f"the weight {name}", p) for name, p in engine.policy.named_parameters())
-        raise NonFiniteError(
-            f"The policy gave the log-probability {rollout.logp[row, t]} to its action in environment {row} "
-            f"at step {self._step_count + t}; expected a finite number"
-            + (f", but {weight}. " if weight else ": its logits overflow. ")
-            + "It was not updated with this rollout. Look for a learning rate that is too high."
-        )
+    def _fill(self, rollout: Rollout, engine: Engine) -> Inputs:
+        """Act and step in every column; the observations after the last one."""
+        environments, normaliser = self.environments, self.normalisers.observations
+        num_steps = rollout.logp.shape[1]
+        self._column = 0
+        noise = self.noise(num_steps, environments.num_envs, self.rng)
+        engine.begin_rollout(environments.num_envs, self.rng)
+        inputs, action_mask, env_seconds = self._inputs, self._action_mask, 0.0
+        for t in range(num_steps):
+            self._column = t
+            if normaliser is not None:
+                rollout.raw[:, t] = inputs["flat"]
+            for rows in environments.row_groups:
+                out = rollout.acted(rows, t)
+                engine.act(inputs, normaliser, action_mask, noise[t], rows, out)
+                environments.send(rows, out.actions)
+            before = perf_counter()
+            step = environments.receive()
+            env_seconds += perf_counter() - before
+            inputs, action_mask = step.inputs, step.action_mask
+            rollout.rewards[:, t] = step.rewards
+            rollout.terminated[:, t] = step.terminated
+            rollout.truncated[:, t] = step.truncated
+            if step.phantom is not None:
+                np.logical_not(step.phantom, out=rollout.mask[:, t])
+            if step.cut is not None:
+                rollout.mask[step.cut, t] = False
+                rollout.ended[step.cut, t] = True
+            if step.final_rows is not None and step.final_inputs is not None:
+                rollout.finals.append((t, step.final_rows, step.final_inputs))
+        self._action_mask = action_mask
+        rollout.env_seconds = env_seconds
+        return inputs
 
-    def _circumstances(self, rollout: Rollout, row: int, column: int) -> str:
-        """Worker, seed and action of a row, in words."""
-        environments, action = self.environments, None
-        if column >= 0:
-            chosen = rollout.actions[row, column]
-            action = action_text(environments.action_layout.to_env_single(chosen, environments.squash))
-        return circumstances(environments.worker_of(row), environments.seed_of(row), action)
+    def _check(self, rollout: Rollout, engine: Engine, num_steps: int, last: Inputs) -> None:
+        check_numbers(rollout, self.environments, last, num_steps, self._step_count)
+        check_policy(rollout, engine.policy, num_steps, self._step_count)
 
     def _count_episodes(self, rollout: Rollout) -> list[tuple[float, int, bool]]:
-        """(return, length, terminated) of every episode that ended in the rollout, in order of its column;
-        one that a fault cut is none.
+        """(return, length, terminated) of every episode that ended in the rollout, by column.
+
+        One that a fault cut is not an episode.
         """
         running = np.cumsum(np.where(rollout.mask, rollout.rewards, 0.0), axis=1) + self._returns[:, None]
         lengths = np.cumsum(rollout.mask, axis=1) + self._lengths[:, None]
         found = []
-        self._returns, self._lengths = running[:, -1].copy(), lengths[:, -1].copy()
+        self._returns = running[:, -1].copy()
+        self._lengths = lengths[:, -1].copy()
         for row in np.flatnonzero(rollout.ended.any(axis=1)):
             ends = np.flatnonzero(rollout.ended[row])
             totals, counts = running[row, ends], lengths[row, ends]
@@ -267,61 +184,3 @@ class Collector:
             self._returns[row] -= totals[-1]
             self._lengths[row] -= counts[-1]
         return [episode[1:] for episode in sorted(found, key=lambda episode: episode[0])]
-
-
-def next_values(values: Array, rollout: Rollout, engine: Any) -> Array:
-    """V of the true next observation of every step [B, T]: also at a truncation and at the end of the
-    rollout.
-    """
-    following = np.empty_like(values)
-    following[:, :-1] = values[:, 1:]
-    following[:, -1] = engine.values(rollout.last)
-    if rollout.finals:
-        names = rollout.finals[0][2]
-        finals = engine.values({n: np.concatenate([x[n] for _, _, x in rollout.finals]) for n in names})
-        columns = np.concatenate([np.full(len(rows), t) for t, rows, _ in rollout.finals])
-        following[np.concatenate([rows for _, rows, _ in rollout.finals]), columns] = finals
-    return following
-
-
-def to_batch(rollout: Rollout, engine: Any, normalisers: Normalisers, settings: UpdateSettings) -> Batch:
-    """Values, advantages and returns of a rollout, as the Batch [B, T] that the update rules take."""
-    if normalisers.rewards is None:
-        rewards = rollout.rewards.astype(np.float32)
-    else:
-        if (
-            float(normalisers.rewards.moments.count) == 0
-        ):  # nothing to scale the very first rollout by but itself
-            normalisers.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
-            rollout.reward_statistics_taken = True
-        rewards = normalisers.rewards(rollout.rewards)
-    flat = {name: x.reshape(-1, *x.shape[2:]) for name, x in rollout.inputs.items()}
-    values = engine.values(flat).reshape(rollout.logp.shape)
-    following, mask = next_values(values, rollout, engine), rollout.mask
-    if isinstance(settings, ReinforceSettings) and not settings.baseline:
-        mask = mask & finished(rollout.ended, mask)
-        values, following = np.zeros_like(values), np.zeros_like(values)
-    ends = (rollout.terminated, rollout.ended, mask)
-    advantages = engine.gae(rewards, values, following, *ends, settings.gamma, settings.gae_lambda)
-    numbers = {
-        "actions": rollout.actions,
-        "old_logp": rollout.logp,
-        "old_values": values,
-        "advantages": advantages,
-        "returns": advantages + values,
-        "mask": mask,
-    }
-    tensors = {name: torch.from_numpy(x).to(engine.device) for name, x in numbers.items()}
-    inputs = {name: torch.from_numpy(x).to(engine.device) for name, x in rollout.inputs.items()}
-    return Batch(inputs=inputs, **tensors)
-
-
-def finished(ended: Array, mask: Array) -> Array:
-    """True [B, T] for steps whose episode ends inside the rollout, and not in a fault that cut it (``ended``
-    where ``mask`` is False).
-    """
-    found, whole = np.zeros_like(ended), np.zeros(len(ended), bool)
-    for t in range(ended.shape[1] - 1, -1, -1):
-        whole = np.where(ended[:, t], mask[:, t], whole)
-        found[:, t] = whole
-    return found

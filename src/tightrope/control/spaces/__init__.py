@@ -1,1 +1,0 @@
-"""Observation and action spaces."""
