@@ -154,7 +154,7 @@ PHASES = {
     "statistics": ("tightrope.control.policy.normalise.Normalisers", "update", 5),
     "row": (Run, "record", 4),
     "episodes": (Run, "record_episodes", 4),
-    "before a save": (train, "save_agent", 2),
+    "before a save": (Agent, "save", 2),
     "inside a save": ("tightrope.runs.checkpoint", "write_file", 4),
     "renaming": ("tightrope.runs.durable", "put", 2),
     "summary": (Run, "finish", 1),
@@ -339,7 +339,7 @@ def test_resume_says_what_it_cannot_promise(tmp_path, monkeypatch):
     told = [line for line in said if "begin anew" in line or "versions" in line or "->" in line]
     assert len(told) == 2, said
     assert "numpy" in told[0] and "-> 0.1 since the checkpoint" in told[0]
-    assert "4 environments begin anew at step 200" in told[1]
+    assert "4 environments begin new episodes at step 200" in told[1]
 
 
 def test_evaluating_twice_gives_the_same(whole):

@@ -11,20 +11,12 @@ from typing import Any
 from tightrope.control.agent import AGENTS, Agent, Progress
 from tightrope.control.evaluate import EVALUATION_SEED, evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
-from tightrope.control.saving import (
-    name_again,
-    rebuild,
-    restore,
-    resume_episodes,
-    roll_back,
-    save_agent,
-    snapshot,
-)
+from tightrope.control.saving import name_again, rebuild
 from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
-from tightrope.runs.history import steps_in
+from tightrope.runs.history import Checkpoint, steps_in
 from tightrope.runs.run import Run
 from tightrope.training.grid import crosses
 from tightrope.training.report import Reporter, say, silent, teller, warn
@@ -101,10 +93,10 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
     agent = rebuild(source, run_dir, command="resume", **more)
     if point is not None:
         with understood(point.folder):
-            restore(agent, point.tensors, state)
+            agent.restore(point.tensors, state)
             if agent.steps != step_of(point.folder):
                 raise ValueError(f"its steps are {agent.steps}, its name says {step_of(point.folder)}")
-            lines = resume_episodes(agent, state)
+            lines = agent.resume_episodes(state.get("episodes"))
         for line in lines:
             teller(report)(line)
     run.rewind(point)
@@ -158,7 +150,7 @@ def _updates(agent: Agent, run: Run, total_steps: int, report: Reporter) -> Iter
     updates = rolling_back(
         lambda: agent.iterate(total_steps, start=0),
         run,
-        lambda point: roll_back(agent, point),
+        lambda point: _roll_back(agent, point),
         teller(report),
         taken=agent.rollbacks,
         limit=agent.settings.max_rollbacks,
@@ -167,6 +159,11 @@ def _updates(agent: Agent, run: Run, total_steps: int, report: Reporter) -> Iter
         if agent.rollbacks:
             progress.metrics["train/rollbacks"] = float(agent.rollbacks)
         yield progress
+
+
+def _roll_back(agent: Agent, point: Checkpoint) -> int:
+    agent.roll_back(point.tensors, point.state)
+    return agent.steps
 
 
 def _start(agent: Agent, run: Run, total_steps: int) -> dict[str, Any]:
@@ -233,7 +230,7 @@ class _Evaluator:
         """Save the policy as the best; where the disk refuses, the best one is still the one before."""
         try:
             with signals.whole():
-                save_agent(self.agent, self.run.best)
+                self.agent.save(self.run.best)
         except CannotWrite as error:
             warn(self.report, f"The best policy is not saved: {error.what} {error.advice}. Training goes on.")
         else:
@@ -245,7 +242,7 @@ class _Evaluator:
 
 
 def _save(agent: Agent, run: Run, best: float, wall: float, report: Reporter, *, final: bool = False) -> None:
-    tensors, state = snapshot(agent)
+    tensors, state = agent.snapshot()
     state |= {"best": best, "wall_seconds": wall}
     state["episodes"] = agent.collector.state() if agent.steps else None
     keep, say = agent.settings.keep_checkpoints, teller(report)

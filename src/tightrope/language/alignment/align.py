@@ -13,7 +13,6 @@ from typing import Any
 
 from tightrope.language.alignment.iteration import Aligned, Trainer
 from tightrope.language.alignment.kl import bias_of
-from tightrope.language.alignment.state import restore_state
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import NOT_HERE, AlignSettings
 from tightrope.language.supervised.prepare import threads
@@ -131,7 +130,7 @@ def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
     settings, report = trainer.settings, trainer.report
     point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
     if point is not None:
-        restore_state(trainer, point)
+        trainer.restore(point)
     if total_episodes is not None and total_episodes < trainer.episodes:
         raise ValueError(
             f"{run.path} has had {trainer.episodes:,} responses already; expected total_episodes of as "

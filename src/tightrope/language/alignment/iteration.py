@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -33,10 +35,11 @@ from tightrope.language.alignment.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.alignment.monitor import Monitor
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.alignment.samples import sample_rows
-from tightrope.language.alignment.state import save_model, save_state, updates
 from tightrope.language.data.examples import Prompt, hold_out, read_prompts, read_rows
 from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.model import lora
 from tightrope.language.model.load import context_length, find_model
+from tightrope.language.model.saving import write_model
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.reward.call import RewardError
@@ -51,9 +54,14 @@ from tightrope.language.reward.judge import (
 from tightrope.language.settings import AlignSettings
 from tightrope.maths.values import explained_variance
 from tightrope.runs import signals
+from tightrope.runs.checkpoint import understood
+from tightrope.runs.durable import whole
+from tightrope.runs.history import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.training.grid import crosses
+from tightrope.training.parameters import Tensors, put_back, tensors_of
 from tightrope.training.report import Reporter, teller, warn
+from tightrope.training.rollback import rolling_back
 
 
 @dataclass(frozen=True)
@@ -134,7 +142,7 @@ class Trainer:
         facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self.roles.lines()}
         self.report("start", {"settings": dataclasses.asdict(settings), **facts, **total})
         with run, signals.stoppable():
-            for metrics, rows in updates(self, run):
+            for metrics, rows in self._updates(run):
                 signals.check()
                 self.newest = metrics
                 run.record(self.episodes, metrics["time/seconds"], metrics)
@@ -143,9 +151,9 @@ class Trainer:
                 self.report("update", {**event, **total})
                 if self._reached(settings.checkpoint_every):
                     if self._next_prompts():
-                        save_state(self, run)
+                        self._save(run)
                     self.report("samples", {"step": self.episodes, "rows": rows})
-            save_state(self, run, final=True)
+            self._save(run, final=True)
             save_model(self.roles, run.path, settings)
             summary = self._summary(run, self.newest)
             run.finish(summary)
@@ -154,6 +162,17 @@ class Trainer:
             self._warn("not one step was taken: no response had a score that counts. The model is as it was.")
         self.report("finish", summary)
         return Aligned(run.path, summary, rows)
+
+    def _updates(self, run: Run) -> Iterator[tuple[dict[str, float], list[dict[str, Any]]]]:
+        limit, tell = self.settings.max_rollbacks, teller(self.report)
+        return rolling_back(self.iterate, run, self.roll_back, tell, taken=self.rollbacks, limit=limit)
+
+    def _save(self, run: Run, *, final: bool = False) -> None:
+        """A checkpoint; the best one has the highest gold score."""
+        tensors, state = self.snapshot()
+        keep, gold = self.settings.keep_checkpoints, self.monitor.newest_gold
+        say = teller(self.report)
+        run.save(self.episodes, tensors, state, keep=keep, say=say, merit=gold, final=final)
 
     def _next_prompts(self) -> int:
         """Prompts of the next iteration; 0 at the end of the budget."""
@@ -190,6 +209,77 @@ class Trainer:
             "run_dir": str(run.path),
             "final": {name: value for name, value in metrics.items() if name.startswith(shown)},
         }
+
+    # ------------------------------------------------------------------------------------------ the state
+
+    def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
+        """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
+        state: dict[str, Any] = {
+            "story": "align",
+            "episodes": self.episodes,
+            "iteration": self.iteration,
+            "kl_beta": self.kl_beta,
+            "rollbacks": self.rollbacks,
+            "micro_batch_size": self.micro_batch_size,
+            "prompt_position": self.order.position,
+            "prompts_sha256": self._hash_of_prompts(),
+            "rng": {"update": self.update_rng.bit_generator.state},
+            "monitor": self.monitor.state(),
+            "stopped": self.stopped,
+            "newest": self.newest,
+            "seconds": self.seconds,
+        }
+        if self.pretraining is not None:
+            state["rng"]["ptx"] = self.pretraining.rng.bit_generator.state
+        return tensors_of(self.roles.parameters(), self.optimiser), state
+
+    def restore(self, point: Checkpoint) -> None:
+        """Put back a checkpoint of a run with the same settings. ValueError for one of another command or
+        of other prompts.
+        """
+        folder, tensors, state = point
+        if state.get("story") != "align":
+            raise ValueError(f"{folder} is no checkpoint of an alignment run.")
+        if state.get("prompts_sha256") != self._hash_of_prompts():
+            raise ValueError(
+                f"{folder} is of a run with other prompts than these {len(self.prompts):,}. Give those that "
+                "the run began with, or begin a new run."
+            )
+        with understood(folder):
+            put_back(tensors, self.roles.parameters(), self.optimiser)
+            self.episodes = int(state["episodes"])
+            self.iteration = int(state["iteration"])
+            self.kl_beta = float(state["kl_beta"])
+            self.rollbacks = int(state.get("rollbacks", 0))
+            self.micro_batch_size = state.get("micro_batch_size", self.micro_batch_size)
+            self.order.position = int(state["prompt_position"])
+            self.update_rng.bit_generator.state = state["rng"]["update"]
+            self.monitor.restore(state["monitor"])
+            self.stopped = bool(state["stopped"])
+            self.seconds = float(state["seconds"])
+            self.newest = {k: math.nan if x is None else float(x) for k, x in state["newest"].items()}
+            if self.pretraining is not None:
+                self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
+
+    def roll_back(self, point: Checkpoint) -> int:
+        """Go back to a checkpoint of this run; random numbers from there on depend on the seed, the episode
+        and the number of rollbacks. Returns the episode. The micro-batch that fits into memory is kept.
+        """
+        rollbacks, size = self.rollbacks + 1, self.micro_batch_size
+        self.restore(point)
+        self.rollbacks = rollbacks
+        self.micro_batch_size = size
+        other = np.random.default_rng([self.settings.seed, 9, self.episodes, rollbacks])
+        self.update_rng.bit_generator.state = other.bit_generator.state
+        return self.episodes
+
+    def _hash_of_prompts(self) -> str:
+        digest = hashlib.sha256()
+        for prompt in (*self.prompts, *self.held_out):
+            digest.update(repr(prompt.tokens).encode())
+        return digest.hexdigest()
+
+    # ---------------------------------------------------------------------------------------- an iteration
 
     def iterate(self) -> Iterator[tuple[dict[str, float], list[dict[str, Any]]]]:
         """One iteration at a time: its metrics, and its rows for samples.jsonl."""
@@ -340,3 +430,14 @@ class Trainer:
         judged = np.concatenate(found)
         mean = float(judged.mean()) if len(judged) else float("nan")
         return {"eval/gold": mean, "eval/gold_masked": float(len(self.held_out) - len(judged))}
+
+
+def save_model(roles: Roles, path: Path, settings: AlignSettings) -> None:
+    """RUN/model for AutoModelForCausalLM.from_pretrained, tokenizer and chat template included; with LoRA the
+    adapter is folded in, and lies in RUN/adapter for PEFT as well.
+    """
+    name = "policy" if settings.tune == "lora" else None
+    write_model(roles.model, roles.tokenizer, path / "model", name)
+    if name is not None:
+        with whole(path / "adapter") as folder:
+            lora.save_adapter(roles.model, name, folder, base_model=find_model(settings.model))
