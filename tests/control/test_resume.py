@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from tightrope.training.grid import crosses
 
 import tightrope
 from tightrope.control import train
@@ -23,7 +24,6 @@ from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve
 from tightrope.runs import checkpoint
 from tightrope.runs.run import Run
-from tightrope.training.grid import crosses
 
 SMALL = {
     "total_steps": 600, "num_envs": 4, "num_steps": 25, "seed": 3, "minibatch_size": 50, "num_epochs": 2,

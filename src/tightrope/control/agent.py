@@ -6,7 +6,6 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -34,27 +33,11 @@ from tightrope.control.settings import TrainSettings, settings_to_json
 from tightrope.control.spaces.observations import ObservationLayout
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint
-from tightrope.training.grid import crosses
+from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors
 
 Array = np.ndarray
 CRUMB = 16  # columns; ten epochs on fewer steps than this would only add noise to a finished policy
-
-
-@dataclass(frozen=True)
-class Progress:
-    """One update of a run: agent steps so far, the budget, every metric, and the episodes that ended.
-
-    ``on_grid``: the update reached a point of the checkpoint grid; environments that cannot give their state
-    begin anew behind it, whether or not anything is saved. ``before``: ``step`` before the update.
-    """
-
-    step: int
-    total_steps: int
-    metrics: dict[str, float]
-    episodes: list[tuple[float, int, bool]]
-    on_grid: bool = False
-    before: int = 0
 
 
 class Agent:
@@ -99,6 +82,7 @@ class Agent:
         self.sampling_rng, self.update_rng, self.predict_rng = (np.random.default_rng(x) for x in seeds)
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
         self.steps, self.rollbacks, self.kl_beta = 0, 0, getattr(present.update, "kl_beta", None)
+        self.changes: dict[str, Any] = {}  # of the update rule's settings, made by a listener
         self.fresh, self.notify = True, notify  # fresh: episodes begin anew with the next rollout
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
 
@@ -112,7 +96,7 @@ class Agent:
             pass
         return self
 
-    def iterate(self, total_steps: int | None = None, *, start: int | None = None) -> Iterator[Progress]:
+    def iterate(self, total_steps: int | None = None, *, start: int | None = None) -> Iterator[Update]:
         """The same, one update at a time: ``for report in agent.iterate(n): ...``.
 
         ``start``: the agent step at which this budget began (default: now).
@@ -130,7 +114,7 @@ class Agent:
             first, after = False, self.steps - start
             on_grid = crosses(before, after, budget, every)
             self.fresh = on_grid and not self.environments.gives_state
-            yield Progress(after, budget, metrics, episodes, on_grid, before)
+            yield Update(after, budget, metrics, before, on_grid, episodes)
 
     def _next_columns(self, budget: int, start: int) -> int:
         """Columns of the next rollout, never more than the budget allows; a crumb at its end is left
@@ -144,7 +128,7 @@ class Agent:
         self, columns: int, progress: float, *, check: bool
     ) -> tuple[dict[str, float], list[tuple[float, int, bool]]]:
         """collect -> advantages -> update -> statistics."""
-        present = self.settings.update.at(progress)
+        present = self.settings.update.unchecked(**self.changes).at(progress)
         if isinstance(present, PPOSettings) and self.kl_beta is not None:
             present = present.unchecked(kl_beta=self.kl_beta)
         set_learning_rates(self.optimiser, present)
