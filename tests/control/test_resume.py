@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from tightrope.training.grid import crosses
 
 import tightrope
 from tightrope.control import train
@@ -24,6 +23,7 @@ from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve
 from tightrope.runs import checkpoint
 from tightrope.runs.run import Run
+from tightrope.training.learner import crosses
 
 SMALL = {
     "total_steps": 600, "num_envs": 4, "num_steps": 25, "seed": 3, "minibatch_size": 50, "num_epochs": 2,
@@ -335,7 +335,7 @@ def test_resume_says_what_it_cannot_promise(tmp_path, monkeypatch):
     killed(settings, tmp_path / "run", monkeypatch, Agent, "_one_update", 4)
     said: list[str] = []
     monkeypatch.setattr(np, "__version__", "0.1")
-    train.resume(tmp_path / "run", report=lambda event, data: said.append(str(data.get("text", ""))))
+    train.resume(tmp_path / "run", listeners=[lambda event: said.append(str(event))])
     told = [line for line in said if "begin anew" in line or "versions" in line or "->" in line]
     assert len(told) == 2, said
     assert "numpy" in told[0] and "-> 0.1 since the checkpoint" in told[0]
