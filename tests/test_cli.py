@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tightrope import cli
+from tightrope.cli import main as cli
 from tightrope.algorithms.settings import range_text
 from tightrope.cli import display, flags, options
 from tightrope.control.settings import (
