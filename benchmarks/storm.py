@@ -51,9 +51,9 @@ def control(env: str, **values: Any) -> Callable[[Path, Any], None]:
         from tightrope.control.train import resume, train
 
         if (folder / "settings.json").exists():
-            resume(folder, report=report)
+            resume(folder, listeners=[report])
         else:
-            train(resolve(env, "ppo", {**common, **values}), run_dir=folder, report=report)
+            train(resolve(env, "ppo", {**common, **values}), run_dir=folder, listeners=[report])
 
     return run
 
@@ -68,7 +68,7 @@ def language(folder: Path, report: Any) -> None:
     from tightrope.language.alignment.align import align, resume_align
 
     prompts = ["".join(random.Random(k).choices("abcdefghijklmnop", k=1 + k % 5)) for k in range(11)]
-    given = {"prompts": prompts, "reward": letters, "report": report}
+    given = {"prompts": prompts, "reward": letters, "listeners": [report]}
     if (folder / "settings.json").exists():
         resume_align(folder, **given)
         return
@@ -154,9 +154,11 @@ def _live(story: str, folder: Path, slow: bool, out: int) -> int:
     def tell(what: str, step: int) -> None:
         os.write(out, f"{what} {step}\n".encode())
 
-    def report(event: str, data: dict[str, Any]) -> None:
-        if event in ("start", "update"):
-            tell(event, int(data["step"]))
+    def report(event: Any) -> None:
+        from tightrope.training.events import Started, Updated
+
+        if isinstance(event, Started | Updated):
+            tell("start" if isinstance(event, Started) else "update", event.step)
 
     save, sync = checkpoint.save, os.fsync
 

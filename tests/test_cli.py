@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from tightrope import cli
+from tightrope.cli import main as cli
 from tightrope.algorithms.settings import range_text
-from tightrope.cli import flags, options, panel
+from tightrope.cli import display, flags, options
 from tightrope.control.settings import (
     ALGORITHM_SETTINGS,
     TrainSettings,
@@ -26,6 +26,7 @@ from tightrope.control.settings import (
     settings_to_json,
     values_from_json,
 )
+from tightrope.training.events import Evaluated, Finished, Listeners, Started, Updated
 
 ALGORITHMS = list(ALGORITHM_SETTINGS)
 
@@ -459,25 +460,22 @@ def a_run(folder: Path, stop_at: int | None = None) -> Any:
     """A training function that reports 100 updates as the real one does, without learning anything."""
     from tightrope.runs.run import Run
 
-    def train(settings: TrainSettings, run_dir: str | None, report: Any) -> dict[str, Any]:
+    def train(settings: TrainSettings, run_dir: str | None, listeners: Any) -> dict[str, Any]:
+        report = Listeners(listeners)
         with Run.create(folder / "run", settings_to_json(settings), "name") as run:
-            report("line", {"text": "clip is high", "warning": True})
-            where = {"run_dir": str(run.path), "step": 0, "total_steps": 1000}
-            report("start", {"settings": SETTINGS, **where, "lines": ["engine: fused"]})
+            report.warn("clip is high")
+            report(Started(str(run.path), SETTINGS, 0, 1000, ("engine: fused",)))
             for update in range(1, 101):
                 values = {"rollout/ep_rew_mean": float(update), "train/approx_kl": 0.01, "time/fps": 5000.0}
                 values |= {"rollout/ep_len_mean": 20.0, "train/clip_fraction": 0.1}
                 run.record(10 * update, update / 50, values)
-                data = {"step": 10 * update, "total_steps": 1000, "metrics": values, "seconds": update / 50}
-                report("update", data)
+                report(Updated(10 * update, 1000, update / 50, values))
                 if update % 20 == 0:
-                    report(
-                        "evaluation", {"step": 10 * update, "eval/mean_reward": 3.0, "eval/std_reward": 1.0}
-                    )
+                    report(Evaluated(10 * update, {"eval/mean_reward": 3.0, "eval/std_reward": 1.0}))
                 if update == stop_at:
                     raise KeyboardInterrupt
             run.finish(SUMMARY)
-        report("finish", SUMMARY)
+        report(Finished(SUMMARY))
         return SUMMARY
 
     return train
@@ -607,10 +605,10 @@ def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) 
             return True
 
     stream = Terminal()
-    report = panel.choose(stream, quiet=False, live=True)
+    report = display.choose(stream, quiet=False, live=True)
     begin = time.monotonic()
     with report:
-        a_run(tmp_path)(TrainSettings(), None, report)
+        a_run(tmp_path)(TrainSettings(), None, [report])
     paints = stream.getvalue().count("CartPole-v1")
     assert 2 <= paints <= 4 + 4 * (time.monotonic() - begin)
     last = stream.getvalue().rpartition("CartPole-v1")[2]
@@ -630,29 +628,29 @@ def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) 
 @pytest.mark.parametrize("environment", [{"NO_COLOR": "1"}, {"TERM": "dumb"}, {"CI": "true"}])
 def test_no_panel_where_it_is_not_wanted(environment: dict[str, str]) -> None:
     terminal = types.SimpleNamespace(isatty=lambda: True)
-    assert panel.can_live(terminal, {"TERM": "xterm"})  # type: ignore[arg-type]
-    assert not panel.can_live(terminal, environment)  # type: ignore[arg-type]
-    assert not panel.can_live(types.SimpleNamespace(isatty=lambda: False), {})  # type: ignore[arg-type]
+    assert display.can_live(terminal, {"TERM": "xterm"})  # type: ignore[arg-type]
+    assert not display.can_live(terminal, environment)  # type: ignore[arg-type]
+    assert not display.can_live(types.SimpleNamespace(isatty=lambda: False), {})  # type: ignore[arg-type]
 
 
 def test_curves_rise_with_their_values() -> None:
-    assert panel.sparkline([1, 2, 3, 4, 5, 6, 7, 8], 8) == panel.BARS
-    assert panel.sparkline([5.0, 5.0], 8) == "▁▁"
-    assert panel.sparkline([], 8) == ""
-    assert len(panel.sparkline(list(range(1000)), 30)) == 30
-    lines = panel.curve([(10 * k, float(k)) for k in range(200)], width=40, height=4)
+    assert display.sparkline([1, 2, 3, 4, 5, 6, 7, 8], 8) == display.BARS
+    assert display.sparkline([5.0, 5.0], 8) == "▁▁"
+    assert display.sparkline([], 8) == ""
+    assert len(display.sparkline(list(range(1000)), 30)) == 30
+    lines = display.curve([(10 * k, float(k)) for k in range(200)], width=40, height=4)
     assert len(lines) == 5
     filled = [sum(not c.isspace() for c in line.partition("│")[2]) for line in lines[:4]]
     assert filled == sorted(filled)
     assert filled[-1] >= 39
     assert lines[-1].split() == ["0", "1,990", "steps"]
-    assert panel.curve([(1, 1.0)]) == []
-    assert len(panel.curve([(1, 5.0), (2, 5.0)])) == 9
-    assert panel.curve([(1, float("nan")), (2, 1.0)]) == []
+    assert display.curve([(1, 1.0)]) == []
+    assert len(display.curve([(1, 5.0), (2, 5.0)])) == 9
+    assert display.curve([(1, float("nan")), (2, 1.0)]) == []
 
 
 def test_figures_are_short() -> None:
-    assert [panel.number(x) for x in (1234.56, 12.25, 0.01234, 0.0, None, float("nan"))] == [
+    assert [display.number(x) for x in (1234.56, 12.25, 0.01234, 0.0, None, float("nan"))] == [
         "1,234.6",
         "12.25",
         "0.0123",
@@ -660,7 +658,7 @@ def test_figures_are_short() -> None:
         "-",
         "-",
     ]
-    assert [panel.clock(x) for x in (7, 67.4, 3725, float("nan"))] == ["0:07", "1:07", "1:02:05", "-"]
+    assert [display.clock(x) for x in (7, 67.4, 3725, float("nan"))] == ["0:07", "1:07", "1:02:05", "-"]
 
 
 def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
@@ -670,9 +668,9 @@ def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
         def write(self, text: str) -> int:
             raise BrokenPipeError
 
-    report = panel.choose(Gone(), quiet=False, live=False)
+    report = display.choose(Gone(), quiet=False, live=False)
     with report:
-        summary = a_run(tmp_path)(TrainSettings(), None, report)
+        summary = a_run(tmp_path)(TrainSettings(), None, [report])
     assert summary == SUMMARY
     assert report.step == 1000
 
@@ -680,8 +678,8 @@ def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
 def test_time_left_counts_this_runs_steps_only(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    progress = panel.Progress()
-    progress.take("start", {"settings": SETTINGS, "run_dir": "run", "step": 400, "total_steps": 1000})
+    progress = display.Position()
+    progress.take(Started("run", SETTINGS, 400, 1000, ()))
     now[0] += 10.0
-    progress.take("update", {"step": 600, "total_steps": 1000, "metrics": {}, "seconds": 1.0})
+    progress.take(Updated(600, 1000, 1.0, {}))
     assert progress.seconds_left() == pytest.approx(20.0)

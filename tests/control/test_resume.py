@@ -23,7 +23,7 @@ from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve
 from tightrope.runs import checkpoint
 from tightrope.runs.run import Run
-from tightrope.training.grid import crosses
+from tightrope.training.learner import crosses
 
 SMALL = {
     "total_steps": 600, "num_envs": 4, "num_steps": 25, "seed": 3, "minibatch_size": 50, "num_epochs": 2,
@@ -154,7 +154,7 @@ PHASES = {
     "statistics": ("tightrope.control.policy.normalise.Normalisers", "update", 5),
     "row": (Run, "record", 4),
     "episodes": (Run, "record_episodes", 4),
-    "before a save": (train, "save_agent", 2),
+    "before a save": (Agent, "save", 2),
     "inside a save": ("tightrope.runs.checkpoint", "write_file", 4),
     "renaming": ("tightrope.runs.durable", "put", 2),
     "summary": (Run, "finish", 1),
@@ -335,11 +335,11 @@ def test_resume_says_what_it_cannot_promise(tmp_path, monkeypatch):
     killed(settings, tmp_path / "run", monkeypatch, Agent, "_one_update", 4)
     said: list[str] = []
     monkeypatch.setattr(np, "__version__", "0.1")
-    train.resume(tmp_path / "run", report=lambda event, data: said.append(str(data.get("text", ""))))
+    train.resume(tmp_path / "run", listeners=[lambda event: said.append(str(event))])
     told = [line for line in said if "begin anew" in line or "versions" in line or "->" in line]
     assert len(told) == 2, said
     assert "numpy" in told[0] and "-> 0.1 since the checkpoint" in told[0]
-    assert "4 environments begin anew at step 200" in told[1]
+    assert "4 environments begin new episodes at step 200" in told[1]
 
 
 def test_evaluating_twice_gives_the_same(whole):

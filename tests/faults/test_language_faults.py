@@ -16,7 +16,7 @@ from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.language.alignment.iteration import Trainer
 from tightrope.language.reward.functions import RewardError, Rewards
 from tightrope.language.settings import AlignSettings
-from tightrope.training.report import silent
+from tightrope.training.events import Listeners
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def trainer(folder, **values):
         "num_epochs": 1, "learning_rate": 1e-3,
     }  # fmt: skip
     settings = AlignSettings(model=folder).with_values(**{**usual, **values})
-    return Trainer(settings, ["ab", "cde", "f"], "length", None, silent)
+    return Trainer(settings, ["ab", "cde", "f"], "length", None, Listeners())
 
 
 def trained(made):
@@ -61,7 +61,7 @@ def test_responses_without_end_and_without_text_train(tmp_path, what, stops, tok
     source = with_stops(tmp_path / "model", stops or [3])
     more = {"samples_per_prompt": 2} if critic == "none" else {}
     made = trainer(source, max_new_tokens=tokens, ignore_eos=stops is None, critic=critic, kl=kl, **more)
-    for metrics, rows in made.iterate():
+    for metrics, rows in ((u.metrics, u.samples) for u in made.iterate()):
         assert metrics["objective/truncated_fraction"] == cut == 1.0 - metrics["objective/eos_fraction"]
         assert metrics["objective/response_length"] == length
         assert math.isfinite(metrics["train/policy_gradient_loss"])
@@ -132,7 +132,7 @@ def test_a_minibatch_that_does_not_fit_is_halved_told_and_remembered(folder, mon
     results = []
     for fits in (100, 3):
         made, lines = trainer(folder, total_episodes=24), []
-        made.report = lambda event, data, lines=lines: lines.append(data["text"])
+        made.listeners.add(lambda event, lines=lines: lines.append(event.text))
         whole, sizes = module.PolicyModel.__call__, []
 
         def asked(self, part, fits=fits, sizes=sizes, whole=whole):
@@ -143,7 +143,7 @@ def test_a_minibatch_that_does_not_fit_is_halved_told_and_remembered(folder, mon
 
         with monkeypatch.context() as patch:
             patch.setattr(module.PolicyModel, "__call__", asked)
-            rows = [metrics for metrics, _ in made.iterate()]
+            rows = [update.metrics for update in made.iterate()]
         results.append(trained(made))
         if fits == 3:
             assert sizes == [8, 4, 2, 2, 2, 2] + [2] * 8  # tried once, remembered for the rest of the run
@@ -281,9 +281,9 @@ def test_batches_without_one_score_teach_nothing_and_the_run_goes_on(folder, cri
         return [math.nan] * 8 if calls[0] <= 2 else [x + k for k, x in enumerate(scored)]
 
     made = trainer(folder, total_episodes=32, critic=critic, kl_goal=1.0, samples_per_prompt=2)
-    made.judge = Trainer(made.settings, ["ab", "cde", "f"], late, None, silent).judge
+    made.judge = Trainer(made.settings, ["ab", "cde", "f"], late, None, Listeners()).judge
     before, seen = trained(made), []
-    for metrics, rows in made.iterate():
+    for metrics, rows in ((u.metrics, u.samples) for u in made.iterate()):
         seen.append((metrics["objective/masked_samples"], torch.equal(trained(made), before)))
         assert len(rows) == 8 and ("train/grad_norm" in metrics) == (metrics["objective/masked_samples"] == 0)
     assert seen == [(8.0, True), (8.0, True), (0.0, False), (0.0, False)]

@@ -18,6 +18,7 @@ from tightrope.language import align
 from tightrope.language.alignment.align import resume_align
 from tightrope.language.alignment.iteration import Trainer
 from tightrope.runs.run import Run
+from tightrope.training.events import Event, Updated
 
 
 class Brittle(Walk):
@@ -119,12 +120,12 @@ def test_a_language_run_keeps_its_rollbacks_and_its_micro_batch(tmp_path, monkey
     }  # fmt: skip
     align(**given, **how, run_dir=tmp_path / "whole")
 
-    def die(event: str, data: dict[str, Any]) -> None:
-        if event == "update" and data["step"] == 20:
+    def die(event: Event) -> None:
+        if isinstance(event, Updated) and event.step == 20:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        align(**given, **how, run_dir=tmp_path / "hops", report=die)
+        align(**given, **how, run_dir=tmp_path / "hops", listeners=[die])
     resume_align(tmp_path / "hops", **given)
     ends = [Run.open(tmp_path / name).newest() for name in ("whole", "hops")]
     for name in ("rollbacks", "micro_batch_size", "rng", "newest", "episodes"):

@@ -22,6 +22,7 @@ from tightrope.language.supervised.fit import Objective, micro_batches, take_ste
 from tightrope.language.supervised.prepare import load
 from tightrope.language.supervised.sft import hidden_states, mean_loss, token_loss, train_sft
 from tightrope.runs.run import Run
+from tightrope.training.events import Finished, Message, Started, Updated
 
 MODELS = [tiny_llama, tiny_gpt2]
 FACTS = [f"{a} is {b}." for a, b in zip("abcdefgh", "ponmlkji", strict=True)]
@@ -184,7 +185,7 @@ def test_it_learns_facts_and_where_they_end(tmp_path, make, tune):
     settings = settings_of(source, tune=tune, num_epochs=40, held_out=0.0)
     data = [{"prompt": fact[:5], "completion": fact[5:]} for fact in FACTS]
     summary = train_sft(
-        settings, data=data, report=lambda *event: events.append(event), run_dir=tmp_path / "run"
+        settings, data=data, listeners=[lambda event: events.append(event)], run_dir=tmp_path / "run"
     )
 
     model = AutoModelForCausalLM.from_pretrained(tmp_path / "run" / "model")
@@ -198,7 +199,7 @@ def test_it_learns_facts_and_where_they_end(tmp_path, make, tune):
     losses = [row["sft/loss"] for row in Run.open(tmp_path / "run").read_metrics() if "sft/loss" in row]
     assert len(losses) == 80 and losses[-1] < 0.1 < losses[0] / 10
     assert summary["tokens"] == 3 * len(FACTS)
-    assert [kind for kind, _ in events] == ["line", "start", *["update"] * 80, "finish"]
+    assert [type(event) for event in events] == [Message, Started, *[Updated] * 80, Finished]
 
 
 def test_lora_leaves_the_trunk_alone_and_the_merged_model_is_the_adapted_one(tmp_path, folder):
@@ -346,7 +347,7 @@ def test_what_cannot_work_is_said_before_anything_is_written(tmp_path, folder, v
 def test_long_rows_are_reported(tmp_path, folder):
     lines = []
     settings = settings_of(folder, max_tokens=5)
-    train_sft(settings, data=FACTS, run_dir=tmp_path / "run", report=lambda *event: lines.append(event))
-    said = [data["text"] for kind, data in lines if data.get("warning")]
+    train_sft(settings, data=FACTS, run_dir=tmp_path / "run", listeners=[lambda event: lines.append(event)])
+    said = [event.text for event in lines if isinstance(event, Message) and event.level == "warning"]
     cut = "8 of 8 rows have more than max_tokens 5 tokens and were cut"
     assert said == [f"{cut}. Raise max_tokens to keep them whole."]

@@ -59,7 +59,7 @@ def _supervised(name: str, kind: type, given: dict[str, Any]) -> int:
     train, _, columns = _stage(name)
 
     def run(report: Any) -> dict[str, Any]:
-        return train(settings, run_dir=given.get("run_dir"), report=report)
+        return train(settings, run_dir=given.get("run_dir"), listeners=[report])
 
     return _watched(run, columns, "steps", given)
 
@@ -67,7 +67,7 @@ def _supervised(name: str, kind: type, given: dict[str, Any]) -> int:
 def _stage(name: str) -> tuple[Callable[..., dict[str, Any]], Callable[..., dict[str, Any]], Any]:
     """How stage one or two is trained, how gone on with, and the columns that show it."""
     _require_transformers()
-    from tightrope.cli import language_display as display
+    from tightrope.cli import display
 
     if name == "sft":
         from tightrope.language.supervised.sft import resume_sft, train_sft
@@ -91,11 +91,11 @@ def align(words: list[str]) -> int:
         if not getattr(settings, name):
             raise UsageError(f"--{name} is missing. For example: {PROGRAM} align {example}")
     _require_transformers()
-    from tightrope.cli import language_display as display
+    from tightrope.cli import display
     from tightrope.language.alignment.align import align as run_align
 
     def run(report: Any) -> dict[str, Any]:
-        return run_align(settings, run_dir=given.get("run_dir"), report=report).summary
+        return run_align(settings, run_dir=given.get("run_dir"), listeners=[report]).summary
 
     return _watched(run, display.ALIGN, "responses", given)
 
@@ -109,13 +109,13 @@ def resume(given: dict[str, Any]) -> int:
         if OWN_FIELDS[name] in settings:
             return _resume_supervised(name, given)
     _require_transformers()
-    from tightrope.cli import language_display as display
+    from tightrope.cli import display
     from tightrope.language.alignment.align import resume_align
 
     def run(report: Any) -> dict[str, Any]:
         more = {"prompts": given.get("data"), "reward": given.get("reward"), "gold": given.get("gold")}
         return resume_align(
-            given["run"], total_episodes=given.get("total_steps"), report=report, **more
+            given["run"], total_episodes=given.get("total_steps"), listeners=[report], **more
         ).summary
 
     return _watched(run, display.ALIGN, "responses", given)
@@ -132,7 +132,7 @@ def _resume_supervised(name: str, given: dict[str, Any]) -> int:
     _, go_on, columns = _stage(name)
 
     def run(report: Any) -> dict[str, Any]:
-        return go_on(given["run"], data=given.get("data"), report=report)
+        return go_on(given["run"], data=given.get("data"), listeners=[report])
 
     return _watched(run, columns, "steps", given)
 
@@ -298,12 +298,11 @@ def _given_again(run: str | None) -> list[str]:
 
 def _watched(run: Callable[[Any], dict[str, Any]], columns: Any, what: str, given: dict[str, Any]) -> int:
     """Run with the right display; print the end."""
-    from tightrope.cli import panel
-    from tightrope.cli.language_display import Display
+    from tightrope.cli.display import Display, can_live
 
     as_json, quiet = bool(given.get("json")), bool(given.get("quiet"))
     stream = sys.stderr if as_json else sys.stdout
-    live = not as_json and panel.can_live(sys.stdout, dict(os.environ))
+    live = not as_json and can_live(sys.stdout, dict(os.environ))
     display = Display(columns, what, stream, quiet=quiet, live=live)
     from tightrope.cli import farewell
     from tightrope.runs import signals

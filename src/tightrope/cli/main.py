@@ -43,7 +43,7 @@ def train(words: list[str]) -> int:
     def run(report: Any) -> dict[str, Any]:
         from tightrope.control.train import train as run_training
 
-        return run_training(settings, run_dir=given.get("run_dir"), report=report)
+        return run_training(settings, run_dir=given.get("run_dir"), listeners=[report])
 
     return _watched(run, given)
 
@@ -61,7 +61,7 @@ def resume(words: list[str]) -> int:
         from tightrope.control.train import resume as run_training
 
         env, total_steps = given.get("env"), given.get("total_steps")
-        return run_training(given["run"], total_steps=total_steps, report=report, env=env)
+        return run_training(given["run"], total_steps=total_steps, listeners=[report], env=env)
 
     return _watched(run, given)
 
@@ -166,12 +166,12 @@ def _import_named(name: str | None) -> None:
 
 def _watched(run: Callable[[Any], dict[str, Any]], given: Options) -> int:
     """Train with the right display; print the end; on SIGINT and SIGTERM the command that goes on."""
-    from tightrope.cli import panel
+    from tightrope.cli import display
 
     as_json, quiet = bool(given.get("json")), bool(given.get("quiet"))
     stream = sys.stderr if as_json else sys.stdout
-    live = not as_json and panel.can_live(sys.stdout, dict(os.environ))
-    report = panel.choose(stream, quiet=quiet, live=live)
+    live = not as_json and display.can_live(sys.stdout, dict(os.environ))
+    report = display.choose(stream, quiet=quiet, live=live)
     from tightrope.cli import farewell
     from tightrope.runs import signals
 
@@ -191,13 +191,13 @@ def _watched(run: Callable[[Any], dict[str, Any]], given: Options) -> int:
 
 def _print_end(summary: dict[str, Any], run: str, given: Options, quiet: bool, stream: TextIO) -> None:
     """The learning curve, the final evaluation, where the run lies and what to type next."""
-    from tightrope.cli import panel
+    from tightrope.cli import display
     from tightrope.runs.run import Run
 
     if not quiet:
         rows = Run.open(run).read_metrics()
         points = [(row["step"], row.get("rollout/ep_rew_mean")) for row in rows]
-        lines = panel.curve([(step, value) for step, value in points if value is not None])
+        lines = display.curve([(step, value) for step, value in points if value is not None])
         if lines:
             print("\nreturn of the training episodes", *lines, sep="\n", file=stream)
         print(file=stream)
@@ -205,13 +205,13 @@ def _print_end(summary: dict[str, Any], run: str, given: Options, quiet: bool, s
     mean, deviation = final.get("eval/mean_reward"), final.get("eval/std_reward")
     steps, seconds = summary.get("steps"), summary.get("wall_seconds")
     if mean is not None:
-        spread = f" ± {panel.number(deviation)}" if deviation is not None else ""
+        spread = f" ± {display.number(deviation)}" if deviation is not None else ""
         count = final.get("eval/episodes")
         over = f" over {count:.0f} episodes" if count else ""
-        print(f"evaluation   mean return {panel.number(mean)}{spread}{over}", file=stream)
+        print(f"evaluation   mean return {display.number(mean)}{spread}{over}", file=stream)
     if steps is not None and seconds:
         print(
-            f"training     {steps:,} steps in {panel.clock(seconds)} ({steps / seconds:,.0f} steps/s)",
+            f"training     {steps:,} steps in {display.clock(seconds)} ({steps / seconds:,.0f} steps/s)",
             file=stream,
         )
     print(f"run          {run}", file=stream)
@@ -282,7 +282,7 @@ def _is_ours(error: BaseException) -> bool:
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    package = str(Path(__file__).resolve().parent)
+    package = str(Path(__file__).resolve().parents[1])
     return trace is not None and str(Path(trace.tb_frame.f_code.co_filename).resolve()).startswith(
         package + os.sep
     )

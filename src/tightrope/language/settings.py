@@ -44,6 +44,12 @@ class ModelSettings:
         "Checkpoints that are kept: the newest, and the best by held-out figures. none: all.",
         at_least=2,
     )
+    max_rollbacks: int = setting(
+        0,
+        "After a NaN or an infinity: go back to the newest checkpoint this often; 0: end the run.",
+        at_least=0,
+    )
+    tensorboard: bool = setting(False, "Also write TensorBoard event files into the run folder.")
 
     def __post_init__(self) -> None:
         """Check every field against its range."""
@@ -171,11 +177,6 @@ class AlignSettings(ModelSettings):
     ptx_per_response: int = setting(1, "Pretraining texts per response (InstructGPT: 8).", at_least=1)
     reward_timeout: float | None = setting(
         60.0, "Seconds a reward function may take; its samples are left out then. none: forever.", above=0
-    )
-    max_rollbacks: int = setting(
-        0,
-        "After a NaN or an infinity: go back to the newest checkpoint this often; 0: end the run.",
-        at_least=0,
     )
     evaluate_every: float | None = setting(
         0.05, "Fraction of the run between gold scores on held-out prompts.", above=0, at_most=1

@@ -6,23 +6,39 @@ run = align(model="path/to/model", prompts=prompts, reward=reward, total_episode
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tightrope.language.alignment.iteration import Aligned, Trainer
+from tightrope.language.alignment.iteration import Trainer
 from tightrope.language.alignment.kl import bias_of
-from tightrope.language.alignment.state import restore_state
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import NOT_HERE, AlignSettings
 from tightrope.language.supervised.prepare import threads
-from tightrope.runs.history import steps_in
 from tightrope.runs.records import retyped
 from tightrope.runs.run import Run
-from tightrope.training.report import Reporter, say, silent, teller, warn
+from tightrope.training import loop
+from tightrope.training.events import Listener, Listeners
+from tightrope.training.resume import continue_from, newest_point
+from tightrope.training.tensorboard import require_tensorboard
 
 __all__ = ["Aligned", "align", "resume_align"]
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A finished run: its folder, its summary, and a row of metrics per iteration."""
+
+    path: Path
+    summary: dict[str, Any]
+    metrics: list[dict[str, Any]]
+
+    @property
+    def model(self) -> Path:
+        """The folder that AutoModelForCausalLM.from_pretrained loads."""
+        return self.path / "model"
 
 
 @quiet()
@@ -33,7 +49,7 @@ def align(
     reward: Any = None,
     gold: Any = None,
     run_dir: str | Path | None = None,
-    report: Reporter = silent,
+    listeners: Sequence[Listener] = (),
     **values: Any,
 ) -> Aligned:
     """Train a language model against a reward; returns the run.
@@ -45,19 +61,27 @@ def align(
     before anything is trained.
     """
     settings = (settings or AlignSettings()).with_values(**_named(prompts, reward, gold), **values)
+    told = Listeners(listeners)
     for risk in settings.risks():
-        warn(report, risk)
+        told.warn(risk)
     if (bias := bias_of(settings.kl)) is not None:
-        warn(report, f"{bias}.")
+        told.warn(f"{bias}.")
+    require_tensorboard(settings.tensorboard)
     sources = (
         settings.data if prompts is None else prompts,
         settings.reward if reward is None else reward,
         settings.gold if gold is None else gold,
     )
     with threads(settings.threads):
-        trainer = Trainer(settings, *sources, report)
+        trainer = Trainer(settings, *sources, told)
         name = f"align-{Path(settings.model).name}-{settings.seed}"
-        return trainer.run(Run.create(run_dir, dataclasses.asdict(trainer.settings), name))
+        with Run.create(run_dir, trainer.settings_json(), name) as run:
+            return _train(trainer, run)
+
+
+def _train(trainer: Trainer, run: Run) -> Aligned:
+    summary = loop.train(trainer, run, trainer.listeners)
+    return Aligned(run.path, summary, run.read_metrics())
 
 
 def _named(prompts: Any, reward: Any, gold: Any) -> dict[str, str]:
@@ -83,7 +107,7 @@ def resume_align(
     reward: Any = None,
     gold: Any = None,
     total_episodes: int | None = None,
-    report: Reporter = silent,
+    listeners: Sequence[Listener] = (),
 ) -> Aligned:
     """Go on from a run's newest checkpoint, or from the start where there is none yet; the end is that of a
     run without a break, bit for bit.
@@ -102,9 +126,9 @@ def resume_align(
             settings.gold if gold is None else gold,
         )
         with threads(settings.threads):
-            trainer = Trainer(settings, *sources, report)
+            trainer = Trainer(settings, *sources, Listeners(listeners))
             _go_back(trainer, run, total_episodes)
-            return trainer.run(run)
+            return _train(trainer, run)
 
 
 def _require_what_no_file_gives(
@@ -128,10 +152,10 @@ def _require_what_no_file_gives(
 
 def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
     """Put trainer and run to the newest checkpoint, or to the start where there is none."""
-    settings, report = trainer.settings, trainer.report
-    point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
+    settings = trainer.settings
+    point = newest_point(run, trainer.listeners)
     if point is not None:
-        restore_state(trainer, point)
+        trainer.restore(point)
     if total_episodes is not None and total_episodes < trainer.episodes:
         raise ValueError(
             f"{run.path} has had {trainer.episodes:,} responses already; expected total_episodes of as "
@@ -139,10 +163,9 @@ def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
         )
     if point is not None and trainer.episodes >= settings.total_episodes:
         text = f"{run.path} has its {trainer.episodes:,} responses; --total-episodes N goes on from there."
-        say(report, text)
+        trainer.listeners.info(text)
     trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
-    run.rewind(point)
-    run.update_settings(dataclasses.asdict(settings))
+    continue_from(trainer, run, point)
 
 
 def settings_from_json(data: dict[str, Any]) -> AlignSettings:

@@ -1,11 +1,12 @@
-"""The loop of an alignment run: sample -> score -> advantages -> update -> record -> evaluate -> save."""
+"""The state and the iteration of an alignment run: sample -> score -> advantages -> update."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,10 +34,11 @@ from tightrope.language.alignment.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.alignment.monitor import Monitor
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.alignment.samples import sample_rows
-from tightrope.language.alignment.state import save_model, save_state, updates
 from tightrope.language.data.examples import Prompt, hold_out, read_prompts, read_rows
 from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.model import lora
 from tightrope.language.model.load import context_length, find_model
+from tightrope.language.model.saving import write_model
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.reward.call import RewardError
@@ -50,33 +52,22 @@ from tightrope.language.reward.judge import (
 )
 from tightrope.language.settings import AlignSettings
 from tightrope.maths.values import explained_variance
-from tightrope.runs import signals
+from tightrope.runs.checkpoint import understood
+from tightrope.runs.durable import whole
+from tightrope.runs.history import Checkpoint
 from tightrope.runs.run import Run
-from tightrope.training.grid import crosses
-from tightrope.training.report import Reporter, teller, warn
-
-
-@dataclass(frozen=True)
-class Aligned:
-    """A finished run: its folder, its summary, and a row of metrics per iteration."""
-
-    path: Path
-    summary: dict[str, Any]
-    metrics: list[dict[str, Any]]
-
-    @property
-    def model(self) -> Path:
-        """The folder that AutoModelForCausalLM.from_pretrained loads."""
-        return self.path / "model"
+from tightrope.training.events import Listeners
+from tightrope.training.learner import Update, crosses
+from tightrope.training.parameters import Tensors, put_back, tensors_of
 
 
 class Trainer:
-    """The state of an alignment run; `iterate` is the loop."""
+    """The state of an alignment run, a `Learner`."""
 
     def __init__(
-        self, settings: AlignSettings, prompts: Any, reward: Any, gold: Any, report: Reporter
+        self, settings: AlignSettings, prompts: Any, reward: Any, gold: Any, listeners: Listeners
     ) -> None:
-        self.settings, self.report = settings, report
+        self.settings, self.listeners = settings, listeners
         adapter = reward_adapter(reward)
         lora = settings.tune == "lora"
         shared = adapter is not None and lora and shares_trunk(adapter, find_model(settings.model))
@@ -84,7 +75,7 @@ class Trainer:
         self.roles: Roles = make_roles(
             settings,
             on_trunk,
-            teller(report),
+            listeners.tell,
             own_reward=on_trunk is None and is_folder(reward),
         )
         self.prompts = self._read_prompts(prompts)
@@ -102,10 +93,13 @@ class Trainer:
         self.order = PromptOrder(len(self.prompts), settings.seed)
         self.update_rng = np.random.default_rng([settings.seed, 9])
         self.kl_beta = settings.kl_beta
-        self.pretraining = Pretraining.make(settings, self.roles, self._warn) if settings.ptx_weight else None
+        self.pretraining = (
+            Pretraining.make(settings, self.roles, listeners.warn) if settings.ptx_weight else None
+        )
         self.monitor = Monitor(kl_budget=settings.kl_budget)
         self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
         self.seconds, self.rollbacks, self.newest = 0.0, 0, dict[str, float]()
+        self.changes: dict[str, Any] = {}
         self.micro_batch_size = settings.update.micro_batch_size  # halved when memory runs out
         self._told = set[tuple[str, str]]()
 
@@ -117,43 +111,74 @@ class Trainer:
                 f"exceed the model's context of {limit} tokens. Choose less of either."
             )
         rows, longest = read_rows(source), settings.max_prompt_tokens
-        found = read_prompts(rows, self.roles.tokenizer, max_tokens=longest, notify=self._warn)
+        found = read_prompts(rows, self.roles.tokenizer, max_tokens=longest, notify=self.listeners.warn)
         if not found:
             raise ValueError("There are no prompts. Give a list of texts, or a file with a 'prompt' a row.")
         return found
 
-    def _warn(self, text: str) -> None:
-        warn(self.report, text)
+    # ---------------------------------------------------------------------------------------------- the run
 
-    # ------------------------------------------------------------------------------------------ the loop
+    @property
+    def position(self) -> int:
+        """Responses so far."""
+        return self.episodes
 
-    def run(self, run: Run) -> Aligned:
-        """Train until the budget is spent; the run folder then holds everything."""
-        settings = self.settings
-        total = {"total_steps": settings.total_episodes}
-        facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self.roles.lines()}
-        self.report("start", {"settings": dataclasses.asdict(settings), **facts, **total})
-        with run, signals.stoppable():
-            for metrics, rows in updates(self, run):
-                signals.check()
-                self.newest = metrics
-                run.record(self.episodes, metrics["time/seconds"], metrics)
-                run.record_samples(rows)
-                event = {"step": self.episodes, "metrics": metrics, "seconds": metrics["time/seconds"]}
-                self.report("update", {**event, **total})
-                if self._reached(settings.checkpoint_every):
-                    if self._next_prompts():
-                        save_state(self, run)
-                    self.report("samples", {"step": self.episodes, "rows": rows})
-            save_state(self, run, final=True)
-            save_model(self.roles, run.path, settings)
-            summary = self._summary(run, self.newest)
-            run.finish(summary)
+    @property
+    def total(self) -> int:
+        """Responses of the whole run."""
+        return self.settings.total_episodes
+
+    @property
+    def done(self) -> bool:
+        """Whether the budget is spent, of responses or of KL."""
+        return not self._next_prompts()
+
+    @property
+    def merit(self) -> float | None:
+        """The newest gold score."""
+        return self.monitor.newest_gold
+
+    def settings_json(self) -> dict[str, Any]:
+        """The content of settings.json."""
+        return dataclasses.asdict(self.settings)
+
+    def changeable(self) -> Any:
+        """The settings of which some can be changed during the run: the update rule's."""
+        return self.settings.update
+
+    def begin(self) -> list[str]:
+        """The lines that describe the models."""
+        return self.roles.lines()
+
+    def evaluate(self, update: Update | None) -> dict[str, float]:
+        """Nothing: the gold judge is asked before an iteration, so that score and KL are of one policy."""
+        if update is not None:
+            self.newest = update.metrics
+        return {}
+
+    def conclude(self) -> dict[str, float]:
+        """Nothing: the figures of the last iteration are the final ones."""
+        return {}
+
+    def finish(self, run: Run) -> dict[str, Any]:
+        """Write the model; returns the summary."""
+        save_model(self.roles, run.path, self.settings)
         rows = run.read_metrics()
         if rows and not any("train/minibatches" in row for row in rows):
-            self._warn("not one step was taken: no response had a score that counts. The model is as it was.")
-        self.report("finish", summary)
-        return Aligned(run.path, summary, rows)
+            self.listeners.warn(
+                "not one step was taken: no response had a score that counts. The model is as it was."
+            )
+        shown = ("objective/", "eval/")
+        return {
+            "model": self.settings.model,
+            "seed": self.settings.seed,
+            "episodes": self.episodes,
+            "iterations": self.iteration,
+            "wall_seconds": self.newest.get("time/seconds", 0.0),
+            "stopped_early": self.stopped,
+            "run_dir": str(run.path),
+            "final": {name: value for name, value in self.newest.items() if name.startswith(shown)},
+        }
 
     def _next_prompts(self) -> int:
         """Prompts of the next iteration; 0 at the end of the budget."""
@@ -174,35 +199,94 @@ class Trainer:
         """Over-optimisation: warn, and stop at the KL budget before another step is taken."""
         seen = (metrics["objective/kl"], metrics["objective/scores"], metrics.get("eval/gold"))
         for alarm in self.monitor.add(*seen):
-            self._warn(alarm.text)
+            self.listeners.warn(alarm.text)
             self.stopped = self.stopped or alarm.stop
         metrics |= self.monitor.metrics()
 
-    def _summary(self, run: Run, metrics: dict[str, float]) -> dict[str, Any]:
-        shown = ("objective/", "eval/")
-        return {
-            "model": self.settings.model,
-            "seed": self.settings.seed,
-            "episodes": self.episodes,
-            "iterations": self.iteration,
-            "wall_seconds": metrics.get("time/seconds", 0.0),
-            "stopped_early": self.stopped,
-            "run_dir": str(run.path),
-            "final": {name: value for name, value in metrics.items() if name.startswith(shown)},
-        }
+    # ------------------------------------------------------------------------------------------ the state
 
-    def iterate(self) -> Iterator[tuple[dict[str, float], list[dict[str, Any]]]]:
-        """One iteration at a time: its metrics, and its rows for samples.jsonl."""
+    def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
+        """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
+        state: dict[str, Any] = {
+            "story": "align",
+            "episodes": self.episodes,
+            "iteration": self.iteration,
+            "kl_beta": self.kl_beta,
+            "rollbacks": self.rollbacks,
+            "micro_batch_size": self.micro_batch_size,
+            "prompt_position": self.order.position,
+            "prompts_sha256": self._hash_of_prompts(),
+            "rng": {"update": self.update_rng.bit_generator.state},
+            "monitor": self.monitor.state(),
+            "stopped": self.stopped,
+            "newest": self.newest,
+            "seconds": self.seconds,
+        }
+        if self.pretraining is not None:
+            state["rng"]["ptx"] = self.pretraining.rng.bit_generator.state
+        return tensors_of(self.roles.parameters(), self.optimiser), state
+
+    def restore(self, point: Checkpoint) -> None:
+        """Put back a checkpoint of a run with the same settings. ValueError for one of another command or
+        of other prompts.
+        """
+        folder, tensors, state = point
+        if state.get("story") != "align":
+            raise ValueError(f"{folder} is no checkpoint of an alignment run.")
+        if state.get("prompts_sha256") != self._hash_of_prompts():
+            raise ValueError(
+                f"{folder} is of a run with other prompts than these {len(self.prompts):,}. Give those that "
+                "the run began with, or begin a new run."
+            )
+        with understood(folder):
+            put_back(tensors, self.roles.parameters(), self.optimiser)
+            self.episodes = int(state["episodes"])
+            self.iteration = int(state["iteration"])
+            self.kl_beta = float(state["kl_beta"])
+            self.rollbacks = int(state.get("rollbacks", 0))
+            self.micro_batch_size = state.get("micro_batch_size", self.micro_batch_size)
+            self.order.position = int(state["prompt_position"])
+            self.update_rng.bit_generator.state = state["rng"]["update"]
+            self.monitor.restore(state["monitor"])
+            self.stopped = bool(state["stopped"])
+            self.seconds = float(state["seconds"])
+            self.newest = {k: math.nan if x is None else float(x) for k, x in state["newest"].items()}
+            if self.pretraining is not None:
+                self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
+
+    def roll_back(self, point: Checkpoint) -> None:
+        """Go back to a checkpoint of this run; random numbers from there on depend on the seed, the episode
+        and the number of rollbacks. The micro-batch that fits into memory is kept.
+        """
+        rollbacks, size = self.rollbacks + 1, self.micro_batch_size
+        self.restore(point)
+        self.rollbacks = rollbacks
+        self.micro_batch_size = size
+        other = np.random.default_rng([self.settings.seed, 9, self.episodes, rollbacks])
+        self.update_rng.bit_generator.state = other.bit_generator.state
+
+    def _hash_of_prompts(self) -> str:
+        digest = hashlib.sha256()
+        for prompt in (*self.prompts, *self.held_out):
+            digest.update(repr(prompt.tokens).encode())
+        return digest.hexdigest()
+
+    # ---------------------------------------------------------------------------------------- an iteration
+
+    def iterate(self) -> Iterator[Update]:
+        """One iteration at a time."""
         while count := self._next_prompts():
             yield self._one_iteration([self.prompts[i] for i in self.order.take(count)])
 
-    def _one_iteration(self, prompts: Sequence[Prompt]) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    def _one_iteration(self, prompts: Sequence[Prompt]) -> Update:
         """sample -> score -> advantages -> update."""
-        settings, gold = self.settings, dict[str, float]()
+        settings, gold, before = self.settings, dict[str, float](), self.episodes
+        pause = time.perf_counter()
         if self.gold is not None and (not self.episodes or self._reached(settings.evaluate_every)):
-            gold = self.evaluate()  # of the policy whose KL this rollout tells
+            gold = self.gold_scores()  # of the policy that samples next, whose KL is in the same row
         begin = time.perf_counter()
-        present = settings.update.at(self.episodes / settings.total_episodes)
+        pause = begin - pause
+        present = settings.update.unchecked(**self.changes).at(self.episodes / settings.total_episodes)
         set_learning_rates(self.optimiser, present)
         stream = settings.seed + 2**40 * self.rollbacks  # not the numbers that led to a NaN
         keep = (
@@ -235,8 +319,6 @@ class Trainer:
                 metrics["train/explained_variance"] = float(
                     explained_variance(batch.old_values, batch.returns, batch.mask)
                 )
-        if self.rollbacks:
-            metrics["train/rollbacks"] = float(self.rollbacks)
         metrics["objective/kl_beta"] = self.kl_beta
         metrics["train/learning_rate"] = present.learning_rate
         metrics["time/score_seconds"] = scored - gathered
@@ -247,11 +329,10 @@ class Trainer:
         self.episodes += len(asked)
         self.iteration += 1
         seconds = metrics["time/update_seconds"] + scored - begin
-        self.seconds += seconds
-        metrics["time/seconds"] = self.seconds
         metrics["time/fps"] = float(experience.responses.mask.sum()) / seconds
-        told = (asked, experience, scores, batch, valid, self.episodes)
-        return metrics, sample_rows(self.roles.tokenizer, *told)
+        rows = sample_rows(self.roles.tokenizer, asked, experience, scores, batch, valid, self.episodes)
+        on_grid = self._reached(settings.checkpoint_every)
+        return Update(self.episodes, self.total, metrics, before, on_grid=on_grid, samples=rows, pause=pause)
 
     def _update(self, batch: Batch, present: Any, experience: Experience) -> dict[str, float]:
         """PPO, or the critic alone while it warms up."""
@@ -281,7 +362,7 @@ class Trainer:
     def _smaller(self, size: int) -> None:
         """Memory ran out: ``size`` responses a pass from now on."""
         self.micro_batch_size = size
-        self._warn(
+        self.listeners.warn(
             f"memory ran out; from now on {size} responses a pass, and none is kept for the update. The "
             f"gradient is the same. Say --micro-batch-size {size} to begin with it."
         )
@@ -311,7 +392,7 @@ class Trainer:
         for fault in scores.faults:
             if (judge + fault.function, fault.kind) not in self._told:
                 self._told.add((judge + fault.function, fault.kind))
-                self._warn(judge + fault.text)
+                self.listeners.warn(judge + fault.text)
 
     def _trainer_state(self) -> SimpleNamespace:
         """What TRL's reward functions may look at: iterations so far and in all, passes over the prompts."""
@@ -322,7 +403,7 @@ class Trainer:
             episode=self.episodes,
         )
 
-    def evaluate(self) -> dict[str, float]:
+    def gold_scores(self) -> dict[str, float]:
         """The mean gold score of responses to held-out prompts, sampled as in training, as many at a time;
         and how many of them the judge gave no score.
         """
@@ -340,3 +421,14 @@ class Trainer:
         judged = np.concatenate(found)
         mean = float(judged.mean()) if len(judged) else float("nan")
         return {"eval/gold": mean, "eval/gold_masked": float(len(self.held_out) - len(judged))}
+
+
+def save_model(roles: Roles, path: Path, settings: AlignSettings) -> None:
+    """RUN/model for AutoModelForCausalLM.from_pretrained, tokenizer and chat template included; with LoRA the
+    adapter is folded in, and lies in RUN/adapter for PEFT as well.
+    """
+    name = "policy" if settings.tune == "lora" else None
+    write_model(roles.model, roles.tokenizer, path / "model", name)
+    if name is not None:
+        with whole(path / "adapter") as folder:
+            lora.save_adapter(roles.model, name, folder, base_model=find_model(settings.model))

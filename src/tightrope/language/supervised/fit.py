@@ -1,17 +1,16 @@
-"""The loop that supervised fine-tuning and reward modelling share, and what stands before it: memory, model,
-data.
+"""What supervised fine-tuning and reward modelling share: the state of a run, and one optimiser step.
 
-minibatch -> micro-batches, whose gradients add up -> Adam -> record -> save; held-out examples after an epoch
+minibatch -> micro-batches, whose gradients add up -> Adam; held-out examples after every epoch
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,13 +23,11 @@ from tightrope.algorithms.optimise import Adam, Brake, Meter
 from tightrope.algorithms.settings import scheduled
 from tightrope.language.data.split import Item
 from tightrope.language.settings import SupervisedSettings
-from tightrope.language.supervised.progress import Progress, load_progress, save_progress
-from tightrope.runs import signals
 from tightrope.runs.checkpoint import understood
+from tightrope.runs.history import Checkpoint
 from tightrope.runs.run import Run
-from tightrope.training.grid import crosses
-from tightrope.training.parameters import put_back, tensors_of
-from tightrope.training.report import Reporter, teller
+from tightrope.training.learner import Update, crosses
+from tightrope.training.parameters import Tensors, put_back, tensors_of
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,8 @@ class Objective:
 
     ``loss(items)`` is the loss summed over their terms, and sums of further figures by name; ``count(item)``
     its number of terms, ``length(item)`` its tokens. Metrics are named ``name/...``, those of the optimiser
-    ``steps/...``; ``seen`` names a metric of all terms so far. ``evaluate()`` looks at held-out items.
+    ``steps/...``; ``seen`` names a metric of all terms so far. ``evaluate()`` gives the figures of held-out
+    items. ``save(folder, newest)`` writes the model into the run folder and returns numbers for its summary.
     """
 
     name: str
@@ -49,69 +47,171 @@ class Objective:
     count: Callable[[Any], int]
     length: Callable[[Any], int]
     evaluate: Callable[[], dict[str, float]]
+    save: Callable[[Path, dict[str, float]], dict[str, Any]] = lambda folder, newest: {}
     seen: str | None = None
 
 
-def fit(
-    objective: Objective,
-    parameters: Sequence[nn.Parameter],
-    settings: SupervisedSettings,
-    run: Run,
-    report: Reporter,
-    lines: Sequence[str],
-) -> dict[str, float]:
-    """Train, from the newest checkpoint of the run where it has one; returns the newest value of every
-    metric. A step is one minibatch; ``lines`` are reported at the start.
-
-    Raises NonFiniteError before a step with a NaN or an infinity in its gradient, ValueError for a checkpoint
-    of other data.
+class SupervisedLearner:
+    """The state of supervised training, a `Learner`: ``step`` optimiser steps, ``seen`` terms, the newest
+    value of every metric, and the micro-batch that fits into memory. A step is one minibatch.
     """
-    group = {"params": list(parameters), "lr": settings.learning_rate}
-    optimiser = Adam([group], eps=1e-8, fused=True)
-    brake, items = Brake(parameters[0].device), objective.items
-    each = math.ceil(len(items) / settings.minibatch_size)
-    total = each * settings.num_epochs
-    fresh = Progress(objective.name, len(items), micro_batch_size=settings.micro_batch_size)
-    now, saved = load_progress(run, fresh, teller(report))
-    if saved is not None:
-        with understood(saved.folder):
-            put_back(saved.tensors, parameters, optimiser)
-    run.rewind(saved)  # without a checkpoint what stands at step 0 is recorded again
-    run.update_settings(dataclasses.asdict(settings))
-    facts = {"run_dir": str(run.path), "step": now.step, "total_steps": total}
-    report("start", {"settings": run.settings, "lines": list(lines), **facts})
-    if not now.step and (first := objective.evaluate()):
-        now.newest |= first
-        run.record(0, 0.0, first)
-    for minibatch in islice(minibatches(items, settings), now.step, None):
-        signals.check()
-        clock = time.perf_counter()
-        rate = scheduled(settings.learning_rate, settings.learning_rate_schedule, now.step / total)
-        optimiser.param_groups[0]["lr"] = rate
-        parts = Parts(now.micro_batch_size)
-        metrics = take_step(objective, minibatch, optimiser, brake, settings, parts)
-        metrics |= {f"{objective.steps}/learning_rate": rate or 0.0, **parts.metrics()}
-        now.step, now.micro_batch_size = now.step + 1, parts.size
-        now.seen += sum(objective.count(item) for item in minibatch)
-        if objective.seen is not None:
-            metrics[objective.seen] = float(now.seen)
-        now.seconds += time.perf_counter() - clock
-        if now.step % each == 0:
-            metrics |= objective.evaluate()
-        metrics["time/seconds"] = now.seconds
-        now.newest |= metrics
-        run.record(now.step, now.seconds, metrics)
-        event = {"step": now.step, "metrics": metrics, "seconds": now.seconds}
-        report("update", {**event, "total_steps": total})
-        if now.step == total or crosses(now.step - 1, now.step, total, settings.checkpoint_every):
-            keep, say, final = settings.keep_checkpoints, teller(report), now.step == total
-            save_progress(run, now, tensors_of(parameters, optimiser), keep=keep, say=say, final=final)
-    return now.newest
+
+    def __init__(
+        self,
+        objective: Objective,
+        parameters: Sequence[nn.Parameter],
+        settings: SupervisedSettings,
+        lines: Sequence[str] = (),
+    ) -> None:
+        self.objective = objective
+        self.parameters = parameters
+        self.settings = settings
+        self.lines = list(lines)
+        group = {"params": list(parameters), "lr": settings.learning_rate}
+        self.optimiser = Adam([group], eps=1e-8, fused=True)
+        self.steps_per_epoch = math.ceil(len(objective.items) / settings.minibatch_size)
+        self.step = 0
+        self.seen = 0
+        self.seconds = 0.0
+        self.rollbacks = 0
+        self.newest: dict[str, float] = {}
+        self.micro_batch_size = settings.micro_batch_size
+        self.changes: dict[str, Any] = {}
+
+    @property
+    def position(self) -> int:
+        """Optimiser steps so far."""
+        return self.step
+
+    @property
+    def total(self) -> int:
+        """Optimiser steps of all epochs."""
+        return self.steps_per_epoch * self.settings.num_epochs
+
+    @property
+    def done(self) -> bool:
+        """Whether every epoch is over."""
+        return self.step >= self.total
+
+    @property
+    def merit(self) -> float | None:
+        """The newest figure of held-out examples; higher is better."""
+        loss = self.newest.get("sft/held_out_loss")
+        return self.newest.get("reward/held_out_accuracy") if loss is None else -loss
+
+    def settings_json(self) -> dict[str, Any]:
+        """The content of settings.json."""
+        return dataclasses.asdict(self.settings)
+
+    def changeable(self) -> SupervisedSettings:
+        """The settings of which some can be changed during the run."""
+        return self.settings
+
+    def begin(self) -> list[str]:
+        """The lines that describe model and data."""
+        return self.lines
+
+    def iterate(self) -> Iterator[Update]:
+        """One optimiser step at a time.
+
+        Raises NonFiniteError before a step with a NaN or an infinity in its gradient.
+        """
+        objective, total = self.objective, self.total
+        brake = Brake(self.parameters[0].device)
+        batches = minibatches(objective.items, self.settings, self.rollbacks)
+        for minibatch in islice(batches, self.step, None):
+            now = dataclasses.replace(self.settings, **self.changes)
+            rate = scheduled(now.learning_rate, now.learning_rate_schedule, self.step / total)
+            self.optimiser.param_groups[0]["lr"] = rate
+            memory = Parts(self.micro_batch_size)
+            metrics = take_step(objective, minibatch, self.optimiser, brake, now, memory)
+            metrics |= {f"{objective.steps}/learning_rate": rate or 0.0, **memory.metrics()}
+            self.step += 1
+            self.micro_batch_size = memory.size
+            self.seen += sum(objective.count(item) for item in minibatch)
+            if objective.seen is not None:
+                metrics[objective.seen] = float(self.seen)
+            on_grid = crosses(self.step - 1, self.step, total, now.checkpoint_every)
+            yield Update(self.step, total, metrics, self.step - 1, on_grid)
+
+    def evaluate(self, update: Update | None) -> dict[str, float]:
+        """Held-out figures before the first step and after every epoch."""
+        due = update is None or update.step % self.steps_per_epoch == 0
+        found = self.objective.evaluate() if due else {}
+        self.newest |= found if update is None else update.metrics | found
+        return found
+
+    def conclude(self) -> dict[str, float]:
+        """Nothing: the last epoch was evaluated."""
+        return {}
+
+    def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
+        """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
+        state = {
+            "story": self.objective.name,
+            "items": len(self.objective.items),
+            "step": self.step,
+            "seen": self.seen,
+            "seconds": self.seconds,
+            "newest": self.newest,
+            "micro_batch_size": self.micro_batch_size,
+            "rollbacks": self.rollbacks,
+        }
+        return tensors_of(self.parameters, self.optimiser), state
+
+    def restore(self, point: Checkpoint) -> None:
+        """Put back a checkpoint. ValueError for one of another command, or of other data."""
+        folder, tensors, state = point
+        if state.get("story") != self.objective.name:
+            raise ValueError(
+                f"{folder} is a checkpoint of {state.get('story')!r}, expected {self.objective.name!r}."
+            )
+        items = len(self.objective.items)
+        with understood(folder):
+            step, before = int(state["step"]), state["items"]
+            newest = {name: math.nan if x is None else float(x) for name, x in state["newest"].items()}
+            if before == items:
+                put_back(tensors, self.parameters, self.optimiser)
+            self.step = step
+            self.seen = int(state["seen"])
+            self.seconds = float(state["seconds"])
+            self.newest = newest
+            self.micro_batch_size = state["micro_batch_size"]
+            self.rollbacks = int(state.get("rollbacks", 0))
+        if before != items:
+            raise ValueError(
+                f"{folder.parent.parent} was learning from {before} examples, the data now have {items}. "
+                "Give the data that the run began with, or begin a new run."
+            )
+
+    def roll_back(self, point: Checkpoint) -> None:
+        """Put back a checkpoint of this run; examples come in another order from there on."""
+        rollbacks, size = self.rollbacks + 1, self.micro_batch_size
+        self.restore(point)
+        self.rollbacks = rollbacks
+        self.micro_batch_size = size
+
+    def finish(self, run: Run) -> dict[str, Any]:
+        """Write the model; returns the summary."""
+        numbers = self.objective.save(run.path, self.newest)
+        return {
+            "model": self.settings.model,
+            "seed": self.settings.seed,
+            **numbers,
+            "wall_seconds": self.newest.get("time/seconds", 0.0),
+            "final": {name: value for name, value in self.newest.items() if name != "time/seconds"},
+            "run_dir": str(run.path),
+        }
 
 
-def minibatches(items: Sequence[Item], settings: SupervisedSettings) -> Iterator[list[Item]]:
-    """Those of every step, in order: a function of the seed alone, wherever a run is stopped."""
-    rng, size = np.random.default_rng(settings.seed), settings.minibatch_size
+def minibatches(
+    items: Sequence[Item], settings: SupervisedSettings, rollbacks: int = 0
+) -> Iterator[list[Item]]:
+    """Those of every step, in order: a function of the seed and the number of rollbacks only, wherever a run
+    is stopped. In the epoch of a rollback some examples come twice and others not at all.
+    """
+    rng = np.random.default_rng([settings.seed, rollbacks] if rollbacks else settings.seed)
+    size = settings.minibatch_size
     for _ in range(settings.num_epochs):
         order = rng.permutation(len(items))
         for start in range(0, len(items), size):

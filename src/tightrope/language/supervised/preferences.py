@@ -25,11 +25,11 @@ from tightrope.language.model.load import parts
 from tightrope.language.quiet import quiet
 from tightrope.language.reward.model import RewardModel
 from tightrope.language.settings import RewardSettings
-from tightrope.language.supervised.fit import Objective, fit, micro_batches
+from tightrope.language.supervised.fit import Objective, micro_batches
 from tightrope.language.supervised.preferences_saving import reward_skeleton, save_reward
 from tightrope.language.supervised.prepare import Loaded, precision, prepared, training_rows
-from tightrope.language.supervised.run import announcement, finish, opened, recorded, reopened
-from tightrope.training.report import Reporter, silent, warner
+from tightrope.language.supervised.run import recorded, reopened, train_supervised
+from tightrope.training.events import Listener, Listeners
 
 DEMONSTRATIONS = 1024  # texts on which scores are normalised, at most
 BINS = 10
@@ -112,7 +112,7 @@ def train_reward(
     validation: Any = None,
     demonstrations: Any = None,
     model: tuple[Any, Any] | None = None,
-    report: Reporter = silent,
+    listeners: Sequence[Listener] = (),
     run_dir: str | Path | None = None,
 ) -> dict[str, Any]:
     """Train a reward model; returns the summary that is also written to the run folder.
@@ -127,8 +127,9 @@ def train_reward(
     """
     given = {"data": data, "validation": validation, "demonstrations": demonstrations}
     settings = recorded(settings, **given, model=model and model[0])
-    with prepared(settings, "reward", model, report) as loaded:
-        return _train(settings, loaded, given, report, run_dir)
+    told = Listeners(listeners)
+    with prepared(settings, "reward", model, told) as loaded:
+        return _train(settings, loaded, given, told, run_dir)
 
 
 @quiet()
@@ -139,22 +140,23 @@ def resume_reward(
     validation: Any = None,
     demonstrations: Any = None,
     model: tuple[Any, Any] | None = None,
-    report: Reporter = silent,
+    listeners: Sequence[Listener] = (),
 ) -> dict[str, Any]:
     """Go on with a run of `train_reward`, as `resume_sft` does with one of `train_sft`."""
     given = {"data": data, "validation": validation, "demonstrations": demonstrations}
     run, settings = reopened(RewardSettings, run_dir, **given, model=model and model[0])
-    with run, prepared(settings, "reward", model, report) as loaded:
-        return _train(settings, loaded, given, report, run)
+    told = Listeners(listeners)
+    with run, prepared(settings, "reward", model, told) as loaded:
+        return _train(settings, loaded, given, told, run)
 
 
 def _train(
-    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], report: Reporter, place: Any
+    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners, place: Any
 ) -> dict[str, Any]:
     base, size = parts(loaded.model).base, settings.micro_batch_size or settings.minibatch_size
     head = make_head(loaded.model.config.hidden_size, settings.seed).to(settings.device)
     model, skeleton = RewardModel(base, head, 0.0, loaded.tokenizer), reward_skeleton(loaded)
-    pairs, held, texts = _data(settings, loaded, report, **given)
+    pairs, held, texts = _data(settings, loaded, listeners, **given)
 
     def loss(items: Sequence[Pair]) -> tuple[Tensor, dict[str, Tensor]]:
         with precision(settings):
@@ -174,34 +176,39 @@ def _train(
         accuracy = float(right_order(found).mean())
         return {"reward/held_out_accuracy": accuracy, "reward/calibration_error": calibration(found)[0]}
 
-    own = list(base.parameters())
-    if loaded.adapter is not None:
-        own = lora.adapter_parameters(loaded.model, loaded.adapter)
-    parameters = [*own, *head.parameters()]
-    objective = Objective("reward", "train", pairs, loss, lambda pair: 1, longest, evaluate)
-    words = f"{len(pairs)} pairs; {len(held)} held out"
-    with opened(place, settings, "reward") as run:
-        lines = announcement(settings, loaded, parameters, words)
-        final = fit(objective, parameters, settings, run, report, lines)
+    def save(folder: Path, newest: dict[str, float]) -> dict[str, Any]:
         table = calibration(held_out())[1] if held else []
         with precision(settings):
             mean, deviation = normalise(model, texts, size)
-        save_reward(skeleton, loaded, head.weight, model.shift, run.path, final)
-        numbers = {"pairs": len(pairs), "held_out_pairs": len(held), "calibration": table}
-        scale = {"score_mean": mean, "score_deviation": deviation, "demonstrations": len(texts)}
-        return finish(settings, run, report, final, **numbers, **scale)
+        save_reward(skeleton, loaded, head.weight, model.shift, folder, newest)
+        return {
+            "pairs": len(pairs),
+            "held_out_pairs": len(held),
+            "calibration": table,
+            "score_mean": mean,
+            "score_deviation": deviation,
+            "demonstrations": len(texts),
+        }
+
+    trunk = list(base.parameters())
+    if loaded.adapter is not None:
+        trunk = lora.adapter_parameters(loaded.model, loaded.adapter)
+    parameters = [*trunk, *head.parameters()]
+    objective = Objective("reward", "train", pairs, loss, lambda pair: 1, longest, evaluate, save)
+    words = f"{len(pairs)} pairs; {len(held)} held out"
+    return train_supervised(objective, parameters, settings, loaded, place, listeners, words)
 
 
 def _data(
     settings: RewardSettings,
     loaded: Loaded,
-    report: Reporter,
+    listeners: Listeners,
     data: Any,
     validation: Any,
     demonstrations: Any,
 ) -> tuple[list[Pair], list[Pair], list[tuple[int, ...]]]:
     """Pairs to train on, pairs held out (whole prompts, where there are many), and texts to normalise on."""
-    reading: dict[str, Any] = {"eos": loaded.eos, "max_tokens": settings.max_tokens, "notify": warner(report)}
+    reading: dict[str, Any] = {"eos": loaded.eos, "max_tokens": settings.max_tokens, "notify": listeners.warn}
     pairs = preference_pairs(training_rows(settings, data), loaded.tokenizer, **reading)
     held: list[Pair] = []
     if (source := settings.validation if validation is None else validation) is not None:

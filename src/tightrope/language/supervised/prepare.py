@@ -1,4 +1,4 @@
-"""What stands before supervised training: memory, model, data."""
+"""What supervised training needs first: memory, model, data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tightrope.language.model.load import (
 from tightrope.language.model.reading import pretrained
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs import signals
-from tightrope.training.report import Reporter, say
+from tightrope.training.events import Listeners
 
 
 class Loaded(NamedTuple):
@@ -40,21 +40,21 @@ class Loaded(NamedTuple):
 
 @contextlib.contextmanager
 def prepared(
-    settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None, report: Reporter
+    settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None, listeners: Listeners
 ) -> Iterator[Loaded]:
-    """The model, ready to train inside: its memory told and found to fit before it is loaded, its adapter on,
-    the settings' threads at work. ValueError for a device that is not there.
+    """The model, ready to train inside. It is loaded when its memory was reported and fits; its adapter is
+    active, and the settings' threads are used. ValueError for a device that is not there.
     """
     require_device(settings.device)
     with threads(settings.threads), signals.stoppable():
-        present_memory(settings, given, report)
+        present_memory(settings, given, listeners)
         loaded = load(settings, adapter, given)
         with lora.using(loaded.model, loaded.adapter):
             yield loaded
 
 
-def present_memory(settings: SupervisedSettings, given: tuple[Any, Any] | None, report: Reporter) -> None:
-    """Say what the job will take, and refuse it with advice when it cannot fit: from the config alone.
+def present_memory(settings: SupervisedSettings, given: tuple[Any, Any] | None, listeners: Listeners) -> None:
+    """Report what the job will take, and refuse it with advice when it cannot fit: from the config alone.
 
     The weights of a model that is given, where they lie on the device already, need no more room.
     """
@@ -64,7 +64,7 @@ def present_memory(settings: SupervisedSettings, given: tuple[Any, Any] | None, 
     weights = [] if given is None else [p for p in given[0].parameters() if p.device.type == place.type]
     config = pretrained(AutoConfig, find_model(settings.model)) if given is None else given[0].config
     found, available = ledger(config, job_of(settings)), available_memory(place)
-    say(report, found.text())
+    listeners.info(found.text())
     check(found, None if available is None else available + sum(p.nbytes for p in weights))
 
 

@@ -1,6 +1,6 @@
-"""The run of stage one or two around its loop: new or gone on with, announced, summed up.
+"""A run of sft or reward: new or resumed.
 
-What a file holds is read again when a run goes on; an object in Python must be given again.
+Files are read again when a run is resumed; an object in Python must be given again.
 """
 
 from __future__ import annotations
@@ -15,16 +15,20 @@ from torch import nn
 
 from tightrope.language.model.load import parameter_counts
 from tightrope.language.settings import SupervisedSettings
+from tightrope.language.supervised.fit import Objective, SupervisedLearner
 from tightrope.language.supervised.prepare import Loaded
 from tightrope.runs.run import Run
-from tightrope.training.report import Reporter
+from tightrope.training import loop
+from tightrope.training.events import Listeners
+from tightrope.training.resume import continue_from, newest_point
+from tightrope.training.tensorboard import require_tensorboard
 
 Settings = TypeVar("Settings", bound=SupervisedSettings)
 
 
 def recorded(settings: Settings, **given: Any) -> Settings:
-    """The settings that settings.json keeps: a path that was given in Python replaces the name that stood
-    there, an object leaves its type, as <list>; None leaves what there is.
+    """The settings that settings.json keeps of what was given in Python: paths are stored as text, objects as
+    their <type>; None keeps the setting.
     """
     names: dict[str, Any] = {
         name: str(value) if isinstance(value, str | Path) else f"<{type(value).__name__}>"
@@ -35,7 +39,7 @@ def recorded(settings: Settings, **given: Any) -> Settings:
 
 
 def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[Run, Settings]:
-    """A run to go on with, locked, and its settings with what is given again now.
+    """A run to continue, locked, and its settings with what is given again now.
 
     ValueError when it is another command's, or when something that was an object is not given; RunInUse when
     it has another writer.
@@ -63,15 +67,34 @@ def _settings_again(kind: type[Settings], run: Run, run_dir: str | Path, given: 
     return recorded(kind(**run.settings), **given)
 
 
-def opened(run: Run | str | Path | None, settings: SupervisedSettings, command: str) -> Run:
-    """The run that goes on, or a new one in this folder (None: named after command, model and seed)."""
-    if isinstance(run, Run):
-        return run
-    name = f"{command}-{Path(settings.model).name.strip('<>')}-{settings.seed}"
-    return Run.create(run, dataclasses.asdict(settings), name)
+def train_supervised(
+    objective: Objective,
+    parameters: Sequence[nn.Parameter],
+    settings: SupervisedSettings,
+    loaded: Loaded,
+    place: Run | str | Path | None,
+    listeners: Listeners,
+    data: str,
+) -> dict[str, Any]:
+    """Train in the run that continues, or in a new folder ``place`` (None: named after command, model and
+    seed); ``data`` describes the data. Returns the summary.
+    """
+    learner = SupervisedLearner(objective, parameters, settings, _lines(settings, loaded, parameters, data))
+    if isinstance(place, Run):
+        run = place
+    else:
+        require_tensorboard(settings.tensorboard)
+        name = f"{objective.name}-{Path(settings.model).name.strip('<>')}-{settings.seed}"
+        run = Run.create(place, learner.settings_json(), name)
+    with run:
+        point = newest_point(run, listeners)
+        if point is not None:
+            learner.restore(point)
+        continue_from(learner, run, point)
+        return loop.train(learner, run, listeners)
 
 
-def announcement(
+def _lines(
     settings: SupervisedSettings, loaded: Loaded, parameters: Sequence[nn.Parameter], data: str
 ) -> list[str]:
     """Two lines in words: the model and the data."""
@@ -80,20 +103,3 @@ def announcement(
         f"model: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained",
         f"data: {data}",
     ]
-
-
-def finish(
-    settings: SupervisedSettings, run: Run, report: Reporter, final: dict[str, float], **more: Any
-) -> dict[str, Any]:
-    """Write summary.json and report it; returns it."""
-    summary = {
-        "model": settings.model,
-        "seed": settings.seed,
-        **more,
-        "wall_seconds": final.get("time/seconds", 0.0),
-        "final": {name: value for name, value in final.items() if name != "time/seconds"},
-        "run_dir": str(run.path),
-    }
-    run.finish(summary)
-    report("finish", summary)
-    return summary

@@ -22,11 +22,11 @@ from tightrope.language.model.load import attention_window, parts
 from tightrope.language.model.saving import write_model
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import SFTSettings
-from tightrope.language.supervised.fit import Objective, fit, micro_batches
+from tightrope.language.supervised.fit import Objective, micro_batches
 from tightrope.language.supervised.prepare import Loaded, precision, prepared, training_rows
-from tightrope.language.supervised.run import announcement, finish, opened, recorded, reopened
+from tightrope.language.supervised.run import recorded, reopened, train_supervised
 from tightrope.runs.durable import whole
-from tightrope.training.report import Reporter, silent, warner
+from tightrope.training.events import Listener, Listeners
 
 PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
 
@@ -96,7 +96,7 @@ def train_sft(
     data: Any = None,
     validation: Any = None,
     model: tuple[Any, Any] | None = None,
-    report: Reporter = silent,
+    listeners: Sequence[Listener] = (),
     run_dir: str | Path | None = None,
 ) -> dict[str, Any]:
     """Fine-tune a model; returns the summary that is also written to the run folder.
@@ -109,8 +109,9 @@ def train_sft(
     trained, and DoesNotFit, which is one, for too little memory, before the model is loaded.
     """
     settings = recorded(settings, data=data, validation=validation, model=model and model[0])
-    with prepared(settings, "sft", model, report) as loaded:
-        return _train(settings, loaded, data, validation, report, run_dir)
+    told = Listeners(listeners)
+    with prepared(settings, "sft", model, told) as loaded:
+        return _train(settings, loaded, data, validation, told, run_dir)
 
 
 @quiet()
@@ -120,7 +121,7 @@ def resume_sft(
     data: Any = None,
     validation: Any = None,
     model: tuple[Any, Any] | None = None,
-    report: Reporter = silent,
+    listeners: Sequence[Listener] = (),
 ) -> dict[str, Any]:
     """Go on from a run's newest checkpoint, or from its beginning where there is none yet; the end is that of
     a run without a break, bit for bit.
@@ -130,15 +131,16 @@ def resume_sft(
     """
     given = {"data": data, "validation": validation, "model": model and model[0]}
     run, settings = reopened(SFTSettings, run_dir, **given)
-    with run, prepared(settings, "sft", model, report) as loaded:
-        return _train(settings, loaded, data, validation, report, run)
+    told = Listeners(listeners)
+    with run, prepared(settings, "sft", model, told) as loaded:
+        return _train(settings, loaded, data, validation, told, run)
 
 
 def _train(
-    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, report: Reporter, place: Any
+    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, listeners: Listeners, place: Any
 ) -> dict[str, Any]:
     model, size = loaded.model, settings.micro_batch_size or settings.minibatch_size
-    rows, held = _rows(settings, loaded, data, validation, report)
+    rows, held = _rows(settings, loaded, data, validation, listeners)
 
     def loss(items: Sequence[Packed]) -> tuple[Tensor, dict[str, Tensor]]:
         with precision(settings):
@@ -148,20 +150,21 @@ def _train(
         with precision(settings):
             return {"sft/held_out_loss": mean_loss(model, held, size)} if held else {}
 
+    learnt = sum(_learnt(row) for row in rows)
+
+    def save(folder: Path, newest: dict[str, float]) -> dict[str, Any]:
+        write_model(model, loaded.tokenizer, folder / "model", loaded.adapter)
+        if loaded.adapter is not None:
+            with whole(folder / "adapter") as inner:
+                lora.save_adapter(model, loaded.adapter, inner, base_model=loaded.source)
+        return {"rows": len(rows), "held_out_rows": len(held), "tokens": learnt}
+
     parameters = list(model.parameters())
     if loaded.adapter is not None:
         parameters = lora.adapter_parameters(model, loaded.adapter)
-    learnt = sum(_learnt(row) for row in rows)
-    objective = Objective("sft", "sft", rows, loss, _learnt, len, evaluate, seen="sft/tokens")
+    objective = Objective("sft", "sft", rows, loss, _learnt, len, evaluate, save, seen="sft/tokens")
     words = f"{len(rows)} rows, {learnt:,} tokens to learn; {len(held)} rows held out"
-    with opened(place, settings, "sft") as run:
-        lines = announcement(settings, loaded, parameters, words)
-        final = fit(objective, parameters, settings, run, report, lines)
-        write_model(model, loaded.tokenizer, run.path / "model", loaded.adapter)
-        if loaded.adapter is not None:
-            with whole(run.path / "adapter") as folder:
-                lora.save_adapter(model, loaded.adapter, folder, base_model=loaded.source)
-        return finish(settings, run, report, final, rows=len(rows), held_out_rows=len(held), tokens=learnt)
+    return train_supervised(objective, parameters, settings, loaded, place, listeners, words)
 
 
 def _learnt(row: Packed) -> int:
@@ -169,7 +172,7 @@ def _learnt(row: Packed) -> int:
 
 
 def _rows(
-    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, report: Reporter
+    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, listeners: Listeners
 ) -> tuple[list[Packed], list[Packed]]:
     """The rows to train on and those held out; packed apart, so that nothing held out is trained on."""
 
@@ -180,7 +183,7 @@ def _rows(
             eos=loaded.eos,
             max_tokens=settings.max_tokens,
             on_completions=settings.on_completions,
-            notify=warner(report),
+            notify=listeners.warn,
         )
 
     own, held = examples(training_rows(settings, data)), []

@@ -1,17 +1,5 @@
-"""How a run shows itself: a live panel on a terminal, plain lines elsewhere, or nothing. All three are
-`report` calls.
-
-The training loops call ``report(event, data)``. These are the events and the keys of their data:
-
-- ``line``: ``text``, and ``warning``: True for one, printed also when quiet, and with "warning: " before it.
-- ``start``: ``settings``, ``run_dir``, ``step`` (where the run stands), ``total_steps``, ``lines`` to print.
-- ``update``: ``step``, ``total_steps``, ``seconds`` of training so far, ``metrics`` as in metrics.jsonl.
-- ``evaluation`` (control): ``step``, ``eval/mean_reward``, ``eval/std_reward``, ``eval/mean_length``,
-  ``eval/episodes``.
-- ``samples`` (align): ``step``, ``rows`` as in samples.jsonl.
-- ``finish``: the keys of summary.json.
-
-Steps are environment steps, responses (align), or optimiser steps (sft, reward).
+"""How a run is displayed: live on a terminal, as plain lines elsewhere, or not at all. Each display is a
+listener of the training loop (training/events.py).
 """
 
 from __future__ import annotations
@@ -22,30 +10,30 @@ import sys
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Protocol, TextIO
+from typing import Any, NamedTuple, Protocol, TextIO
 
-from tightrope.training.report import shown
+from tightrope.training.events import Evaluated, Event, Finished, Message, Samples, Started, Updated
 
 BARS = "▁▂▃▄▅▆▇█"
 PLAIN_LINES = 20
 SECONDS_BETWEEN_PAINTS = 0.25
 
 
-class Report(Protocol):
-    """What the training loops call, as a context around the run."""
+class Shown(Protocol):
+    """A display, as a context around the run; ``run`` is its folder, ``step`` its position."""
 
     run: str | None
     step: int
 
-    def __call__(self, event: str, data: dict[str, Any]) -> None: ...
+    def __call__(self, event: Event) -> None: ...
 
-    def __enter__(self) -> Report: ...
+    def __enter__(self) -> Shown: ...
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None: ...
 
 
-def choose(stream: TextIO, *, quiet: bool, live: bool) -> Report:
-    """The report for a stream: nothing when quiet, a panel when ``live``, else plain lines."""
+def choose(stream: TextIO, *, quiet: bool, live: bool) -> Shown:
+    """The display of a control run: nothing when quiet, a panel when ``live``, else plain lines."""
     if quiet:
         return Lines(stream, rows=0)
     return Panel(stream) if live else Lines(stream)
@@ -64,27 +52,27 @@ class Lines:
         self.run: str | None = None
         self.step = 0
         self._stream, self._rows, self._next = stream, rows, 0.0
-        self._progress = Progress()
+        self._progress = Position()
         self._head = self._owed = False
 
-    def __call__(self, event: str, data: dict[str, Any]) -> None:
+    def __call__(self, event: Event) -> None:
         """Print what is due."""
-        self._progress.take(event, data)
+        self._progress.take(event)
         self.run, self.step = self._progress.run, self._progress.step
-        if event == "line":
-            if data["warning"]:
-                print(shown(data), file=sys.stderr, flush=True)
+        if isinstance(event, Message):
+            if event.level == "warning":
+                print(event, file=sys.stderr, flush=True)
             elif self._rows:
-                self._print(shown(data))
-        elif self._rows and event == "start":
-            self._print("\n".join(str(line) for line in data.get("lines", ())))
-        elif self._rows and event == "update":
+                self._print(event.text)
+        elif self._rows and isinstance(event, Started):
+            self._print("\n".join(event.lines))
+        elif self._rows and isinstance(event, Updated):
             self._owed = True
             share = self._progress.total_steps / self._rows
             if self.step >= self._next:
                 self._next = (math.floor(self.step / share) + 1) * share
                 self._row()
-        elif event == "finish" and self._owed:
+        elif isinstance(event, Finished) and self._owed:
             self._row()
 
     def _row(self) -> None:
@@ -131,21 +119,21 @@ class Panel:
         self.run: str | None = None
         self.step = 0
         self._stream = stream
-        self._progress = Progress()
+        self._progress = Position()
         self._live: Any = None
         self._painted = -math.inf
 
-    def __call__(self, event: str, data: dict[str, Any]) -> None:
+    def __call__(self, event: Event) -> None:
         """Take the event in; repaint when the last painting is old enough."""
-        self._progress.take(event, data)
+        self._progress.take(event)
         self.run, self.step = self._progress.run, self._progress.step
-        if event == "line":
-            self._live.console.print(shown(data), markup=False, highlight=False)
-        elif event == "start":
-            for line in data.get("lines", ()):
-                self._live.console.print(str(line), markup=False, highlight=False)
+        if isinstance(event, Message):
+            self._live.console.print(str(event), markup=False, highlight=False)
+        elif isinstance(event, Started):
+            for line in event.lines:
+                self._live.console.print(line, markup=False, highlight=False)
         now = time.monotonic()
-        if now - self._painted >= SECONDS_BETWEEN_PAINTS or event in ("start", "finish"):
+        if now - self._painted >= SECONDS_BETWEEN_PAINTS or isinstance(event, Started | Finished):
             self._painted = now
             self._live.update(self._paint(), refresh=True)
 
@@ -192,8 +180,8 @@ class Panel:
         self._live.stop()
 
 
-class Progress:
-    """Where a run stands: what the events said, and the time left at the speed so far."""
+class Position:
+    """The position and newest figures of a control run, and the time left at the speed so far."""
 
     def __init__(self) -> None:
         self.run: str | None = None
@@ -205,24 +193,24 @@ class Progress:
         self.evaluation: tuple[float, float] | None = None
         self._start_step, self._start_time = 0, time.monotonic()
 
-    def take(self, event: str, data: dict[str, Any]) -> None:
-        """Remember what an event says."""
-        if event == "start":
-            settings = data["settings"]
+    def take(self, event: Event) -> None:
+        """Remember what is displayed."""
+        if isinstance(event, Started):
+            settings = event.settings
             self.title = f"{settings['env']} · {settings['algorithm']} · seed {settings['seed']}"
-            self.run = str(data["run_dir"])
-            self.step = self._start_step = data["step"]
-            self.total_steps = data["total_steps"]
+            self.run = event.run_dir
+            self.step = self._start_step = event.step
+            self.total_steps = event.total_steps
             self._start_time = time.monotonic()
-        elif event == "update":
-            self.step, self.total_steps = data["step"], data["total_steps"]
-            self.metrics = data["metrics"]
+        elif isinstance(event, Updated):
+            self.step, self.total_steps = event.step, event.total_steps
+            self.metrics = event.metrics
             value = self.metrics.get("rollout/ep_rew_mean", math.nan)
             if _finite(value):
                 self.returns.append(float(value))
                 self.length = self.metrics.get("rollout/ep_len_mean")
-        elif event == "evaluation":
-            self.evaluation = (data["eval/mean_reward"], data["eval/std_reward"])
+        elif isinstance(event, Evaluated):
+            self.evaluation = (event.metrics["eval/mean_reward"], event.metrics["eval/std_reward"])
 
     def seconds_left(self) -> float:
         """At the average speed so far, evaluations and saving included; NaN before the first step."""
@@ -307,3 +295,141 @@ def curve(points: Sequence[tuple[int, float]], width: int = 60, height: int = 8)
     first, last = f"{points[0][0]:,}", f"{points[-1][0]:,} steps"
     lines.append(" " * (margin + 2) + first + last.rjust(max(len(last) + 1, len(means) - len(first))))
     return lines
+
+
+# ------------------------------------------------------------------------------- runs of language models
+
+SAMPLES = 3  # responses of a table: the best score, the middle and the worst
+ROWS = 20  # lines of a run that is not watched on a terminal
+
+
+class Column(NamedTuple):
+    """One number of the display: its heading, its metric, how it is written."""
+
+    head: str
+    metric: str
+    form: str
+
+
+ALIGN = (
+    Column("score", "objective/scores", "{:.3f}"),
+    Column("KL", "objective/kl", "{:.2f}"),
+    Column("length", "objective/response_length", "{:.1f}"),
+    Column("EOS", "objective/eos_fraction", "{:.0%}"),
+    Column("distinct", "objective/distinct_2", "{:.2f}"),
+    Column("clipped", "train/clip_fraction", "{:.1%}"),
+    Column("explained", "train/explained_variance", "{:.2f}"),
+    Column("gold", "eval/gold", "{:.3f}"),
+)
+SFT = (Column("loss", "sft/loss", "{:.3f}"), Column("held out", "sft/held_out_loss", "{:.3f}"))
+REWARD = (
+    Column("loss", "reward/loss", "{:.3f}"),
+    Column("accuracy", "reward/accuracy", "{:.1%}"),
+    Column("held out", "reward/held_out_accuracy", "{:.1%}"),
+)
+
+
+class Display:
+    """The display of a language run, a listener and a context around the run: a progress bar on a terminal,
+    a few aligned lines elsewhere. ``run`` is its folder, ``step`` its position.
+    """
+
+    def __init__(
+        self,
+        columns: tuple[Column, ...],
+        what: str,
+        stream: TextIO,
+        *,
+        quiet: bool = False,
+        live: bool = False,
+    ) -> None:
+        self.run: str | None = None
+        self.step = self.total = 0
+        self._columns, self._what, self._stream, self._quiet = columns, what, stream, quiet
+        self._live, self._task = live and not quiet, None
+        self._bar: Any = None
+        self._next, self._begin, self._head = 0.0, time.monotonic(), False
+        self._seen: dict[str, float] = {}
+
+    def __call__(self, event: Event) -> None:
+        """Show what is due."""
+        if isinstance(event, Started):
+            self.run, self.total = event.run_dir, event.total_steps
+            self.step, self._begin = event.step, time.monotonic()
+            for line in event.lines:
+                self._say(line)
+        elif isinstance(event, Message):
+            (self._warn if event.level == "warning" else self._say)(str(event))
+        elif isinstance(event, Updated):
+            self._update(event)
+        elif isinstance(event, Samples) and not self._quiet:
+            from tightrope.language.alignment.samples import print_samples, spread
+
+            rows, title = spread(event.rows, SAMPLES), f"after {event.step:,} responses"
+            console = None if self._bar is None else self._bar.console
+            print_samples(rows, self._stream, title=title, console=console)
+
+    def _update(self, event: Updated) -> None:
+        self.step, self.total = event.step, event.total_steps
+        self._seen |= {k: v for k, v in event.metrics.items() if v is not None}
+        if self._bar is not None:
+            self._bar.update(self._task, completed=self.step, total=self.total, text=self._numbers("  "))
+        elif not self._quiet and (self.step >= self._next or self.step >= self.total):
+            self._next = self.step + self.total / ROWS
+            if not self._head:
+                heads = "".join(f"{column.head:>11}" for column in self._columns)
+                self._say(f"{self._what:>10}{'%':>6}{heads}{'left':>8}")
+                self._head = True
+            cells = "".join(f"{self._cell(column):>11}" for column in self._columns)
+            share = 100 * self.step / max(1, self.total)
+            self._say(f"{self.step:>10,}{share:>6.0f}{cells}{self._left():>8}")
+
+    def _cell(self, column: Column) -> str:
+        value = self._seen.get(column.metric)
+        return "-" if value is None or not math.isfinite(value) else column.form.format(value)
+
+    def _numbers(self, gap: str) -> str:
+        found = [(column.head, self._cell(column)) for column in self._columns]
+        return gap.join(f"{head} {cell}" for head, cell in found if cell != "-")
+
+    def _left(self) -> str:
+        if not self.step:
+            return "-"
+        seconds = (time.monotonic() - self._begin) * (self.total - self.step) / self.step
+        return f"{int(seconds // 60)}:{int(seconds % 60):02d}"
+
+    def _say(self, text: str) -> None:
+        if self._quiet:
+            return
+        if self._bar is not None:
+            self._bar.console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=self._stream, flush=True)
+
+    def _warn(self, text: str) -> None:
+        if self._bar is not None:
+            self._bar.console.print(text, markup=False, highlight=False, style="yellow")
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Display:
+        if self._live:
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            columns = (
+                BarColumn(24),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[text]}"),
+            )
+            self._bar = Progress(*columns, console=Console(file=self._stream))
+            self._task = self._bar.add_task(self._what, total=None, text="")
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
