@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from tightrope import cli
 from tightrope.algorithms.settings import range_text
 from tightrope.cli import flags, options, panel
+from tightrope.cli.main import main
 from tightrope.control.settings import (
     ALGORITHM_SETTINGS,
     TrainSettings,
@@ -31,7 +31,7 @@ ALGORITHMS = list(ALGORITHM_SETTINGS)
 
 
 def run_main(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    code = cli.main(list(words))
+    code = main(list(words))
     captured = capsys.readouterr()
     return code, captured.out, captured.err
 
@@ -394,7 +394,7 @@ def test_a_folder_that_is_not_empty_is_not_used(capsys: pytest.CaptureFixture[st
 def test_an_error_inside_other_code_keeps_its_traceback() -> None:
     fake_training(lambda settings, run_dir, report: int("this is a bug, not a user's mistake"))
     with pytest.raises(ValueError, match="a bug"):
-        cli.main(["train", "CartPole-v1"])
+        main(["train", "CartPole-v1"])
 
 
 def test_a_file_never_names_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -282,7 +282,7 @@ def _is_ours(error: BaseException) -> bool:
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    package = str(Path(__file__).resolve().parent)
+    package = str(Path(__file__).resolve().parents[1])
     return trace is not None and str(Path(trace.tb_frame.f_code.co_filename).resolve()).startswith(
         package + os.sep
     )
