@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Callable, Iterable
-from types import NoneType, UnionType
-from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
+from typing import Any, NoReturn
 
-from tightrope.algorithms.settings import range_text
+from tightrope.settings.fields import kinds, range_text
 from tightrope.settings.peer_names import PEER_NAMES
 
 WIDTH = 100
@@ -116,30 +115,25 @@ def suggestion(name: str, known: list[str]) -> str | None:
 
 
 def settings_fields(kind: type) -> dict[str, dataclasses.Field[Any]]:
-    """The fields of a settings class that are flags: those with a help text, by name."""
-    return {
-        f.name: f for f in dataclasses.fields(kind) if "doc" in f.metadata and f.name not in ("env", "update")
-    }
+    """The fields of a settings class that are flags, by name."""
+    return {f.name: f for f in dataclasses.fields(kind) if f.init and f.name not in ("env", "update")}
 
 
 def add_fields(group: Any, kind: type, names: Iterable[str]) -> None:
-    """One option a field: doc, range and default are its help, the class's annotation is its type."""
-    fields, hints = settings_fields(kind), get_type_hints(kind)
+    """One option a field: its help is made from doc, range and default."""
+    fields = settings_fields(kind)
     for name in names:
-        field, hint = fields[name], hints[name]
-        kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
-        optional, first = NoneType in kinds, kinds[0]
+        field, (plain, optional) = fields[name], kinds(kind)[name]
         flag, text = "--" + name.replace("_", "-"), help_text(field, optional)
-        if first is bool:
+        if plain is bool:
             group.add_argument(
                 flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text
             )
-        elif get_origin(first) is tuple:
+        elif plain is tuple:
             group.add_argument(flag, nargs="*", type=width, metavar="N", help=text)
         else:
-            choices = field.metadata.get("choices")
-            metavar = "WORD" if choices or first is str else "N" if first is int else "X"
-            plain = str if get_origin(first) is Literal else first
+            choices = field.metadata["choices"]
+            metavar = {str: "WORD", int: "N", float: "X"}[plain]
             group.add_argument(flag, type=reader(plain, optional, choices), metavar=metavar, help=text)
 
 
@@ -161,7 +155,7 @@ def help_text(field: dataclasses.Field[Any], optional: bool) -> str:
     return text.replace("%", "%%")
 
 
-def reader(kind: type, optional: bool, choices: tuple[str, ...] | None) -> Callable[[str], Any]:
+def reader(kind: type, optional: bool, choices: tuple[str, ...]) -> Callable[[str], Any]:
     """A function from a word on the command line to a value of ``kind``; ``none`` where that is allowed."""
 
     def read(word: str) -> Any:

@@ -22,7 +22,6 @@ from tightrope.cli.options import (
     settings_option,
 )
 from tightrope.language.settings import (
-    NOT_HERE,
     RECIPES,
     AlignSettings,
     ModelSettings,
@@ -242,8 +241,7 @@ def _align_parser() -> Parser:
     add_fields(
         parser.add_argument_group("alignment"), AlignSettings, [name for name in fields if name not in shared]
     )
-    inner = [name for name in settings_fields(RLHFSettings) if name not in NOT_HERE]
-    add_fields(parser.add_argument_group("update rule: ppo"), RLHFSettings, inner)
+    add_fields(parser.add_argument_group("update rule: ppo"), RLHFSettings, settings_fields(RLHFSettings))
     add_fields(parser.add_argument_group("model and machine"), AlignSettings, shared)
     _run_options(parser)
     group = parser.add_argument_group("recipes and judges")
@@ -272,7 +270,7 @@ def _values(given: dict[str, Any]) -> dict[str, Any]:
 
 def _dry_run(settings: Any, given: dict[str, Any]) -> bool:
     if given.get("dry_run"):
-        print(json.dumps(dataclasses.asdict(settings), indent=None if given.get("json") else 2))
+        print(json.dumps(settings.to_json(), indent=None if given.get("json") else 2))
     return bool(given.get("dry_run"))
 
 

@@ -22,7 +22,6 @@ from tightrope.cli.options import (
     resume_parser,
     train_options,
 )
-from tightrope.control.settings import settings_to_json
 from tightrope.runs.records import printable
 
 # ---------------------------------------------------------------------------- commands
@@ -37,7 +36,7 @@ def train(words: list[str]) -> int:
 
     settings = resolve(env, values.pop("algorithm", "ppo"), values)
     if given.get("dry_run"):
-        print(json.dumps(settings_to_json(settings), indent=None if given.get("json") else 2))
+        print(json.dumps(settings.to_json(), indent=None if given.get("json") else 2))
         return 0
 
     def run(report: Any) -> dict[str, Any]:

@@ -17,8 +17,9 @@ from tightrope.cli.flags import (
     whole,
     with_dashes,
 )
-from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings, typed_values, values_from_json
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 from tightrope.runs.records import retyped
+from tightrope.settings.values import Settings
 
 PROGRAM = "tightrope"
 
@@ -218,7 +219,7 @@ def train_options(words: list[str]) -> tuple[Options, Options]:
     """What the flags say and what the settings file says; the update rule decides which flags there are."""
     words = [with_dashes(word) for word in words]
     path = _value_of("--settings", words)
-    file_values = values_from_json(read_settings(path)) if path else {}
+    file_values = TrainSettings.values_from_json(read_settings(path), path) if path else {}
     algorithm = _value_of("--algorithm", words) or file_values.get("algorithm", "ppo")
     if algorithm not in ALGORITHM_SETTINGS:
         algorithm = "ppo"  # the parser words the error
@@ -293,11 +294,11 @@ def file_values(name: str, path: str | None, flags: Options) -> Options:
     UsageError for the settings of another command, and for what a file cannot hold and no flag gives again:
     an object, or code, which is named by the user alone.
     """
-    from tightrope.language.settings import NOT_HERE, AlignSettings, RewardSettings, RLHFSettings, SFTSettings
+    from tightrope.language.settings import AlignSettings, RewardSettings, SFTSettings
 
     if path is None:
         return {}
-    kinds = {"sft": SFTSettings, "reward": RewardSettings, "align": AlignSettings}
+    kinds: dict[str, type[Settings]] = {"sft": SFTSettings, "reward": RewardSettings, "align": AlignSettings}
     data = read_settings(path)
     if not isinstance(data, dict):
         raise UsageError(f"--settings {path} holds {type(data).__name__}, expected an object with settings.")
@@ -307,11 +308,7 @@ def file_values(name: str, path: str | None, flags: Options) -> Options:
             f"--settings {path} holds the settings of {own}, expected those of {name}. Give settings.json "
             f"of a run of {name}, or type: {PROGRAM} {own} --settings {path}"
         )
-    inner = data.pop("update", {}) if name == "align" else {}
-    if not isinstance(inner, dict):
-        raise UsageError(f"--settings {path}: update is {inner!r}, expected an object with settings.")
-    values = typed_values(data, kinds[name])
-    values |= typed_values({key: x for key, x in inner.items() if key not in NOT_HERE}, RLHFSettings)
+    values = kinds[name].values_from_json(data, f"--settings {path}")
     values = {key: x for key, x in values.items() if key not in flags}
     for key, value in values.items():
         if _must_be_named(key, value):

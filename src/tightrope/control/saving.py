@@ -12,7 +12,7 @@ import torch
 
 from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
 from tightrope.control.agent import AGENTS, Agent, anywhere
-from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
+from tightrope.control.settings import TrainSettings
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
 from tightrope.runs.history import Checkpoint
@@ -31,7 +31,7 @@ def snapshot(agent: Agent) -> tuple[dict[str, dict[str, torch.Tensor]], dict[str
     if normalisers:
         tensors["normalisers"] = normalisers
     state = {
-        "settings": settings_to_json(agent.settings),
+        "settings": agent.settings.to_json(),
         "steps": agent.steps,
         "kl_beta": agent.kl_beta,
         "rollbacks": agent.rollbacks,
@@ -63,7 +63,7 @@ def load(
     """
     folder, tensors, state = read(Path(path), best=best)
     with checkpoint.understood(folder):
-        settings, own_policy = settings_from_json(state["settings"]), bool(state["own_policy"])
+        settings, own_policy = TrainSettings.from_json(state["settings"]), bool(state["own_policy"])
         own_environment = bool(state["own_environment"]) or ":" in settings.env
     if device is not None and device != settings.device:
         settings = settings.with_values(device=device, engine="auto")

@@ -20,7 +20,7 @@ from tightrope.control.saving import (
     save_agent,
     snapshot,
 )
-from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
+from tightrope.control.settings import TrainSettings
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
@@ -48,7 +48,7 @@ def train(
     agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=teller(report))
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
-    with Run.create(run_dir, settings_to_json(settings), name, tensorboard=settings.tensorboard) as run:
+    with Run.create(run_dir, settings.to_json(), name, tensorboard=settings.tensorboard) as run:
         if agent.policy.own is not None or not isinstance(source, str):
             # settings.json alone could not give these first weights again
             _save(agent, run, float("-inf"), 0.0, report)
@@ -79,7 +79,7 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
     point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
-        settings = settings_from_json(run.settings if point is None else state["settings"])
+        settings = TrainSettings.from_json(run.settings if point is None else state["settings"])
         own_environment = bool(state.get("own_environment")) or ":" in settings.env
         own_policy = bool(state.get("own_policy"))
         best = float("-inf") if state.get("best") is None else float(state["best"])
@@ -108,7 +108,7 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
         for line in lines:
             teller(report)(line)
     run.rewind(point)
-    run.update_settings(settings_to_json(agent.settings))
+    run.update_settings(agent.settings.to_json())
     if agent.steps + settings.num_envs > settings.total_steps:
         say(report, f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there.")
     return _continue(agent, run, settings.total_steps, report, best=best, wall=wall)
@@ -175,7 +175,7 @@ def _start(agent: Agent, run: Run, total_steps: int) -> dict[str, Any]:
     who = f"environments: {environments.num_envs} x {settings.env}, {environments.backend}{workers}"
     lines = [agent.engine_line, who]
     return {
-        "settings": settings_to_json(settings),
+        "settings": settings.to_json(),
         "run_dir": str(run.path),
         "lines": lines,
         "step": agent.steps,

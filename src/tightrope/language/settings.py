@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
-from tightrope.algorithms.settings import PPOSettings, Schedule, check_ranges, setting
-from tightrope.settings.peer_names import PEER_NAMES
+from tightrope.algorithms.settings import PPOSettings
+from tightrope.settings.fields import SCHEDULES, Schedule, fixed, of_update_rule, setting
+from tightrope.settings.values import Settings
 
 Tune = Literal["lora", "full"]
-# kl_adapt and the KL-penalised surrogate are the control story's; here kl_beta weighs the KL to the reference
-NOT_HERE = ("kl_beta", "kl_adapt", "recompute_advantages")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelSettings:
+class ModelSettings(Settings):
     """Which model, which of its weights are trained, where, and how often they are saved."""
 
     model: str = setting("glassllm", "Folder or hub id of the model, or a packaged one: glassllm, smollm2.")
@@ -45,10 +43,6 @@ class ModelSettings:
         at_least=2,
     )
 
-    def __post_init__(self) -> None:
-        """Check every field against its range."""
-        check_ranges(self)
-
 
 @dataclass(frozen=True, kw_only=True)
 class SupervisedSettings(ModelSettings):
@@ -66,7 +60,7 @@ class SupervisedSettings(ModelSettings):
     )
     learning_rate: float = setting(1e-4, "Adam's step size.", above=0)
     learning_rate_schedule: Schedule = setting(
-        "linear", "How the learning rate falls over the run.", choices=("constant", "linear", "cosine")
+        "linear", "How the learning rate falls over the run.", choices=SCHEDULES
     )
     max_grad_norm: float | None = setting(1.0, "Limit on the norm of the gradient; none: no limit.", above=0)
 
@@ -102,6 +96,10 @@ class RLHFSettings(PPOSettings):
         None, "Responses per forward pass; splits a minibatch to save memory, the gradient is the same.",
         at_least=1,
     )  # fmt: skip
+    # The KL-penalised surrogate is for control only. In align, kl_beta weighs the KL to the reference.
+    kl_beta: float | None = fixed(None)
+    kl_adapt: float | None = fixed(None)
+    recompute_advantages: bool = fixed(False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +111,7 @@ class AlignSettings(ModelSettings):
     gold: str | None = setting(
         None, "A second judge of the same kinds, asked on held-out prompts; never trained on. none: no judge."
     )
-    update: RLHFSettings = dataclasses.field(
-        default_factory=RLHFSettings, metadata={"doc": "The update rule's."}
-    )
+    update: RLHFSettings = of_update_rule({"ppo": RLHFSettings})
     total_episodes: int = setting(4096, "Responses to train on; never exceeded.", at_least=1)
     batch_size: int = setting(64, "Responses per iteration.", at_least=1)
     samples_per_prompt: int = setting(1, "Responses to each prompt; they share its KV cache.", at_least=1)
@@ -188,9 +184,7 @@ class AlignSettings(ModelSettings):
         """Check ranges, and the settings that must fit each other."""
         if self.critic is None:  # as in Python: no critic
             object.__setattr__(self, "critic", "none")
-        check_ranges(self)
-        if not isinstance(self.update, RLHFSettings):
-            raise ValueError(f"update is {type(self.update).__name__}; expected RLHFSettings.")
+        super().__post_init__()
         if self.batch_size % self.samples_per_prompt:
             raise ValueError(
                 f"batch_size {self.batch_size} is no multiple of samples_per_prompt "
@@ -248,26 +242,6 @@ class AlignSettings(ModelSettings):
     def one_pass(self) -> bool:
         """Whether an epoch is one forward pass over all responses."""
         return self.update.minibatch_size >= self.batch_size and self.update.micro_batch_size is None
-
-    def with_values(self, **values: Any) -> Self:
-        """The same settings with these changed; names of the update rule's fields are found there."""
-        outer = {field.name for field in dataclasses.fields(self)}
-        if "critic" in values and values["critic"] is None:
-            values["critic"] = "none"
-        inner = {name: value for name, value in values.items() if name not in outer}
-        own = {name: value for name, value in values.items() if name in outer}
-        known = {field.name for field in dataclasses.fields(RLHFSettings)} - set(NOT_HERE)
-        unknown = sorted(set(inner) - known)
-        if unknown:
-            import difflib
-
-            peers = PEER_NAMES.get(unknown[0], "")
-            near = [peers] if peers in known | outer else []
-            near += difflib.get_close_matches(unknown[0], known | outer, n=1)
-            hint = f" Did you mean {near[0]}?" if near else ""
-            raise ValueError(f"align has no setting named {', '.join(unknown)}.{hint}")
-        own["update"] = dataclasses.replace(own.get("update", self.update), **inner)
-        return dataclasses.replace(self, **own)
 
     def risks(self) -> list[str]:
         """What is unusual about these settings and why it is risky; they are run as asked all the same."""

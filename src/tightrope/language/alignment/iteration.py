@@ -132,7 +132,7 @@ class Trainer:
         settings = self.settings
         total = {"total_steps": settings.total_episodes}
         facts = {"run_dir": str(run.path), "step": self.episodes, "lines": self.roles.lines()}
-        self.report("start", {"settings": dataclasses.asdict(settings), **facts, **total})
+        self.report("start", {"settings": settings.to_json(), **facts, **total})
         with run, signals.stoppable():
             for metrics, rows in updates(self, run):
                 signals.check()

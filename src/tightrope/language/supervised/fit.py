@@ -6,7 +6,6 @@ minibatch -> micro-batches, whose gradients add up -> Adam -> record -> save; he
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,13 +20,13 @@ from torch import Tensor, nn
 from tightrope.algorithms.memory import Parts
 from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam, Brake, Meter
-from tightrope.algorithms.settings import scheduled
 from tightrope.language.data.split import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.language.supervised.progress import Progress, load_progress, save_progress
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.run import Run
+from tightrope.settings.fields import scheduled
 from tightrope.training.grid import crosses
 from tightrope.training.parameters import put_back, tensors_of
 from tightrope.training.report import Reporter, teller
@@ -77,7 +76,7 @@ def fit(
         with understood(saved.folder):
             put_back(saved.tensors, parameters, optimiser)
     run.rewind(saved)  # without a checkpoint what stands at step 0 is recorded again
-    run.update_settings(dataclasses.asdict(settings))
+    run.update_settings(settings.to_json())
     facts = {"run_dir": str(run.path), "step": now.step, "total_steps": total}
     report("start", {"settings": run.settings, "lines": list(lines), **facts})
     if not now.step and (first := objective.evaluate()):

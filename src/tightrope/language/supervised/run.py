@@ -5,7 +5,6 @@ What a file holds is read again when a run goes on; an object in Python must be 
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,7 +30,7 @@ def recorded(settings: Settings, **given: Any) -> Settings:
         for name, value in given.items()
         if value is not None
     }
-    return dataclasses.replace(settings, **names)
+    return settings.with_values(**names)
 
 
 def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[Run, Settings]:
@@ -49,9 +48,7 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
 
 
 def _settings_again(kind: type[Settings], run: Run, run_dir: str | Path, given: dict[str, Any]) -> Settings:
-    unknown = sorted(set(run.settings) - {field.name for field in dataclasses.fields(kind)})
-    if unknown:
-        raise ValueError(f"{run_dir} has settings that {kind.__name__} has not: {', '.join(unknown)}.")
+    settings = kind.from_json(run.settings, run.path / "settings.json")
     for name, value in given.items():
         if value is None and str(run.settings.get(name)).startswith("<"):
             word = shlex.quote(str(run_dir))
@@ -60,7 +57,7 @@ def _settings_again(kind: type[Settings], run: Run, run_dir: str | Path, given: 
                 f"The {name} of {run_dir} was {run.settings[name]}, an object that no file holds. Give it "
                 f"again: {name}=... in Python{command}."
             )
-    return recorded(kind(**run.settings), **given)
+    return recorded(settings, **given)
 
 
 def opened(run: Run | str | Path | None, settings: SupervisedSettings, command: str) -> Run:
@@ -68,7 +65,7 @@ def opened(run: Run | str | Path | None, settings: SupervisedSettings, command: 
     if isinstance(run, Run):
         return run
     name = f"{command}-{Path(settings.model).name.strip('<>')}-{settings.seed}"
-    return Run.create(run, dataclasses.asdict(settings), name)
+    return Run.create(run, settings.to_json(), name)
 
 
 def announcement(
