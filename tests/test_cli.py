@@ -31,7 +31,8 @@ def run_main(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str,
 
 
 def resolved(*words: str) -> tuple[str, dict[str, Any]]:
-    return options.overrides(*options.train_options(list(words)))
+    _, values = options.training_options("train", list(words))
+    return values.pop("env"), values
 
 
 # ---------------------------------------------------------------------------- the flags
@@ -39,7 +40,7 @@ def resolved(*words: str) -> tuple[str, dict[str, Any]]:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_setting_is_a_flag_with_doc_range_and_default(algorithm: str) -> None:
-    parser = options.train_parser(algorithm)
+    parser = options.training_parser("train", algorithm)
     text = " ".join(parser.format_help().split())
     known = parser.flags()
     for kind in (TrainSettings, ALGORITHM_SETTINGS[algorithm]):
@@ -59,13 +60,13 @@ def test_every_setting_is_a_flag_with_doc_range_and_default(algorithm: str) -> N
 )
 def test_every_option_has_help_and_fits_100_columns(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    parser = options.train_parser(make) if isinstance(make, str) else make()
+    parser = options.training_parser("train", make) if isinstance(make, str) else make()
     assert all(action.help for action in parser._actions)
     assert max(map(len, parser.format_help().splitlines())) <= 100
 
 
 def test_every_setting_stands_in_a_named_group() -> None:
-    assert "more" not in options.train_parser().format_help().split("\n\n")
+    assert "more" not in options.training_parser("train").format_help().split("\n\n")
     listed = [name for names in options.GROUPS.values() for name in names]
     assert sorted(listed) == sorted(flags.settings_fields(TrainSettings))
 
@@ -213,7 +214,7 @@ def test_a_language_settings_file_is_checked(capsys: pytest.CaptureFixture[str],
         ({"batch_sise": 3}, "Did you mean 'batch_size'"),
         ({"batch_size": "8"}, "batch_size is '8' (str); expected int"),
         ({"update": 3}, "update is 3"),
-        ([], "holds list"),
+        ([], "the settings are list"),
     ):
         (tmp_path / "settings.json").write_text(json.dumps(values))
         code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
@@ -227,9 +228,7 @@ def test_a_flag_that_gathers_may_be_repeated() -> None:
 
 
 def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
-    from tightrope.cli.language import _align_parser
-
-    text = " ".join(_align_parser().format_help().split())
+    text = " ".join(options.training_parser("align").format_help().split())
     assert "without its normalisation of rewards" in text
     assert "without its language-modelling loss on correct responses" in text
     ziegler = shown(capsys, "align", "--recipe", "ziegler2019")
@@ -324,7 +323,7 @@ def test_a_wrong_flag_is_answered_with_the_right_one(
 
 
 def test_every_peer_name_leads_to_a_real_flag() -> None:
-    known = {flag for algorithm in ALGORITHMS for flag in options.train_parser(algorithm).flags()}
+    known = {flag for algorithm in ALGORITHMS for flag in options.training_parser("train", algorithm).flags()}
     for name, meant in flags.PEER_NAMES.items():
         assert meant.replace("_", "-").split()[0] in known
         assert name.replace("_", "-") not in known

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import sys
@@ -15,12 +14,12 @@ from tightrope.cli.flags import UsageError, nearest
 from tightrope.cli.options import (
     PROGRAM,
     Options,
+    dry_run,
     evaluate_parser,
-    overrides,
     print_json,
     record_parser,
     resume_parser,
-    train_options,
+    training_options,
 )
 from tightrope.runs.records import printable
 
@@ -29,14 +28,15 @@ from tightrope.runs.records import printable
 
 def train(words: list[str]) -> int:
     """``tightrope train ENV``: resolve the settings, train, print how it went."""
-    given, file_values = train_options(words)
-    env, values = overrides(given, file_values)
+    given, values = training_options("train", words)
+    env = values.pop("env", None)
+    if env is None:
+        raise UsageError("Which task? Give a Gymnasium id: tightrope train CartPole-v1")
     _import_named(given.get("env_module"))
     from tightrope.control.resolve import resolve
 
     settings = resolve(env, values.pop("algorithm", "ppo"), values)
-    if given.get("dry_run"):
-        print(json.dumps(settings.to_json(), indent=None if given.get("json") else 2))
+    if dry_run(settings, given):
         return 0
 
     def run(report: Any) -> dict[str, Any]:
