@@ -18,6 +18,7 @@ from tightrope.cli.options import (
     dry_run,
     output,
     print_json,
+    run_parser,
     training_options,
 )
 from tightrope.language.settings import AlignSettings
@@ -122,12 +123,9 @@ def _resume_supervised(name: str, given: dict[str, Any]) -> int:
 
 def sample(words: list[str]) -> int:
     """``tightrope sample RUN``: responses of the aligned model beside the reference's."""
-    parser = Parser(
-        f"{PROGRAM} sample",
-        "%(prog)s RUN [options]",
-        "Responses of the aligned model beside the reference's.",
+    parser = run_parser(
+        "sample", "Responses of the aligned model beside the reference's.", "Run folder of align."
     )
-    parser.add_argument("run", metavar="RUN", help="Run folder of align.")
     group = parser.add_argument_group("sampling")
     group.add_argument(
         "--prompt", action="append", metavar="TEXT", help="A prompt of your own; may be repeated."

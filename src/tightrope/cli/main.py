@@ -83,12 +83,9 @@ def evaluate(words: list[str]) -> int:
     if given.get("json"):
         print_json(result)
     else:
-        low, high = _interval(result)
-        count = result["episodes"]
-        print(
-            f"mean return {result['mean_return']:.2f}, deviation {result['std_return']:.2f}, {count} episodes"
-        )
-        print(f"95 % interval of the mean: {low:.2f} to {high:.2f}")
+        mean, half_width, count = (result[name] for name in ("mean_return", "ci95", "episodes"))
+        print(f"mean return {mean:.2f}, deviation {result['std_return']:.2f}, {count} episodes")
+        print(f"95 % interval of the mean: {mean - half_width:.2f} to {mean + half_width:.2f}")
     return 0
 
 
@@ -227,16 +224,6 @@ def _command(name: str, run: str, given: Options) -> str:
     if ":" in given.get("env", ""):
         words += ["--env", given["env"]]
     return shlex.join(words)
-
-
-def _interval(result: dict[str, Any]) -> tuple[float, float]:
-    """The 95 % interval, from its two ends or from its half width."""
-    ci = result["ci95"]
-    return (
-        (ci[0], ci[1])
-        if isinstance(ci, list | tuple)
-        else (result["mean_return"] - ci, result["mean_return"] + ci)
-    )
 
 
 def _help() -> str:

@@ -164,14 +164,20 @@ def _groups(command: str) -> Mapping[str, Iterable[str]]:
     return {"data and training": first, "model and machine": shared}
 
 
+def run_parser(
+    command: str, description: str, folder: str = "Run folder, or a folder that agent.save wrote."
+) -> Parser:
+    """The beginning of a command about a run: its name, and the argument RUN with ``folder`` as its help."""
+    parser = Parser(f"{PROGRAM} {command}", "%(prog)s RUN [options]", description)
+    parser.add_argument("run", metavar="RUN", help=folder)
+    return parser
+
+
 def evaluate_parser() -> Parser:
     """The options of ``evaluate``."""
-    parser = Parser(
-        f"{PROGRAM} evaluate",
-        "%(prog)s RUN [options]",
-        "Play episodes with the saved policy of a run: mean return, deviation, 95 % interval.",
+    parser = run_parser(
+        "evaluate", "Play episodes with the saved policy of a run: mean return, deviation, 95 % interval."
     )
-    parser.add_argument("run", metavar="RUN", help="Run folder, or a folder that agent.save wrote.")
     group = parser.add_argument_group("evaluation")
     group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 100).")
     group.add_argument(
@@ -188,12 +194,7 @@ def evaluate_parser() -> Parser:
 
 def record_parser() -> Parser:
     """The options of ``record``."""
-    parser = Parser(
-        f"{PROGRAM} record",
-        "%(prog)s RUN [options]",
-        "Write an mp4 of the saved policy of a run; no display is needed.",
-    )
-    parser.add_argument("run", metavar="RUN", help="Run folder, or a folder that agent.save wrote.")
+    parser = run_parser("record", "Write an mp4 of the saved policy of a run; no display is needed.")
     group = parser.add_argument_group("recording")
     group.add_argument("--out", metavar="FILE.mp4", help="Where to (default RUN/videos/).")
     group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 1).")
@@ -210,12 +211,9 @@ def record_parser() -> Parser:
 
 def resume_parser() -> Parser:
     """The options of ``resume``."""
-    parser = Parser(
-        f"{PROGRAM} resume",
-        "%(prog)s RUN [options]",
-        "Go on with a run from its newest checkpoint, in the same folder.",
+    parser = run_parser(
+        "resume", "Go on with a run from its newest checkpoint, in the same folder.", "Run folder."
     )
-    parser.add_argument("run", metavar="RUN", help="Run folder.")
     group = parser.add_argument_group("going on")
     group.add_argument(
         "--total-steps",
