@@ -1,4 +1,4 @@
-"""Command line flags made from settings: one option a field, and an answer to every name that is not one."""
+"""Command line flags made from settings, one for each field, and suggestions for unknown flags."""
 
 from __future__ import annotations
 
@@ -44,8 +44,7 @@ class Parser(argparse.ArgumentParser):
     ) -> dict[str, Any]:
         """The options given, and only those. ``--num_envs`` is read as ``--num-envs``.
 
-        ``unknown(name, flags)`` words the answer to a flag that is not there; `unknown_flag` is the usual
-        one.
+        ``unknown(name, flags)`` gives the error text for an unknown flag (default: `unknown_flag`).
         """
         words = [with_dashes(word) for word in words]
         known = self.flags()
@@ -57,7 +56,7 @@ class Parser(argparse.ArgumentParser):
         return vars(self.parse_args(words))
 
     def _refuse_repeated(self, words: list[str]) -> None:
-        """UsageError for a flag that stands twice, on or off, unless it gathers what it is given."""
+        """UsageError for a flag that is given twice, on or off, unless its values are collected in a list."""
         names = {s: action for action in self._actions for s in action.option_strings}
         seen: dict[str, str] = {}
         for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
@@ -94,9 +93,7 @@ def nearest(word: str, choices: Iterable[str], cutoff: float = 0.6) -> str | Non
 
 
 def unknown_flag(name: str, known: list[str]) -> str:
-    """The answer to a flag that does not exist: a peer's name for one that does, another spelling, a near
-    one.
-    """
+    """The error text for an unknown flag, with a suggestion."""
     meant = suggestion(name, known)
     return f"There is no flag --{name}." + (
         f" Did you mean --{meant}?" if meant else " --help lists them all."
@@ -104,7 +101,9 @@ def unknown_flag(name: str, known: list[str]) -> str:
 
 
 def suggestion(name: str, known: list[str]) -> str | None:
-    """What a flag was probably meant to be, without its dashes; None when nothing comes near."""
+    """The flag that was probably meant, without its dashes: another library's name, another spelling, or a
+    similar one; None when nothing is near.
+    """
     negated, name = name.startswith("no-"), name.removeprefix("no-").replace("-", "_").lower()
     british = name.replace("ize", "ise")
     peer = PEER_NAMES.get(name) or PEER_NAMES.get(name.rstrip("_"))
@@ -178,7 +177,7 @@ def reader(kind: type, optional: bool, choices: tuple[str, ...]) -> Callable[[st
 
 
 def width(word: str) -> int:
-    """One entry of a list of whole numbers; a task swallowed by the list is told where to go."""
+    """One entry of a list of whole numbers. The error explains that the task comes before the list."""
     try:
         return whole(word)
     except ValueError:

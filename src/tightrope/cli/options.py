@@ -75,7 +75,7 @@ DESCRIPTIONS: dict[str, tuple[str, str, str | None]] = {
         "Recipes: " + "; ".join(f"{name} ({recipe.source})" for name, recipe in RECIPES.items()),
     ),
 }
-# a setting that tells a command's settings.json from the others'
+# the setting by which the settings.json of a command is recognised
 OWN_FIELDS = {"sft": "on_completions", "reward": "demonstrations", "align": "max_new_tokens", "train": "env"}
 
 
@@ -301,7 +301,7 @@ def _value_of(flag: str, words: list[str]) -> str | None:
 
 
 def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
-    """The answer to an unknown flag of train; one that another update rule has is said to be that."""
+    """The error text for an unknown flag of train. It names the update rule that has the flag, if one has."""
     own = " ".join("--" + field.replace("_", "-") for field in settings_fields(ALGORITHM_SETTINGS[algorithm]))
     for other, kind in ALGORITHM_SETTINGS.items():
         flags = [field.replace("_", "-") for field in settings_fields(kind)]
@@ -317,7 +317,7 @@ def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
 
 
 def read_settings(path: str) -> Any:
-    """What a settings.json holds, given as the file or as the folder of its run. UsageError for neither."""
+    """What a settings.json holds, given as a file or as the folder of a run. UsageError if there is none."""
     from tightrope.runs.records import read_json
     from tightrope.runs.signed import unsigned
 

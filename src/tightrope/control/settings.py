@@ -80,18 +80,19 @@ class TrainSettings(Settings):
 
     on_env_fault: str = setting(
         "raise",
-        "When an environment raises, hangs, dies or gives NaN: end the run, or make it anew and go on.",
+        "When an environment raises, hangs, dies or gives NaN: end the run, or make a new one and continue.",
         choices=("raise", "restart"),
     )
     max_env_restarts: int = setting(
         10,
-        "With on_env_fault restart: environments made anew at most, in all; then the run ends.",
+        "With on_env_fault restart: new environments at most, in all; then the run ends.",
         at_least=1,
     )
     env_timeout: float | None = setting(
-        60.0, "Seconds a step or a reset of an environment may take before it counts as hung; none: any.",
+        60.0,
+        "Seconds a step or a reset of an environment may take before it counts as hung; none: no limit.",
         above=0,
-    )  # fmt: skip
+    )
 
     evaluate_every: float | None = setting(
         0.05,
@@ -104,7 +105,7 @@ class TrainSettings(Settings):
     )
     checkpoint_every: float | None = setting(
         0.05,
-        "Fraction of the run between checkpoints, where most environments begin anew; none: only the last.",
+        "Fraction of the run between checkpoints, where most environments are reset; none: only the last.",
         above=0,
         at_most=1,
     )
@@ -130,9 +131,7 @@ class TrainSettings(Settings):
             )
 
     def risks(self) -> list[str]:
-        """What is unusual about these settings and why it is risky; they are trained as asked all the
-        same.
-        """
+        """What is unusual about these settings and why it is risky; training starts all the same."""
         update, found = self.update, []
         if isinstance(update, PPOSettings):
             if update.kl_beta is None and max(update.clip, update.clip_high or 0.0) > 0.3:

@@ -24,7 +24,7 @@ class ModelSettings(Settings):
     lora_alpha: float = setting(32.0, "Adapters are scaled by lora_alpha / lora_rank.", above=0)
     lora_layers: int | None = setting(
         None,
-        "Adapt this many of the top layers; what lies below is computed once for all. none: every layer.",
+        "Adapt this many of the top layers; the layers below are computed once. none: every layer.",
         at_least=1,
     )
     seed: int = setting(0, "Seed of everything random.", at_least=0)
@@ -69,7 +69,7 @@ class SupervisedSettings(ModelSettings):
 class SFTSettings(SupervisedSettings):
     """Supervised fine-tuning on text, prompt and completion, or chats."""
 
-    on_completions: bool = setting(True, "Learn completions and assistant turns alone, not prompts.")
+    on_completions: bool = setting(True, "Learn completions and assistant turns only, not prompts.")
     pack: bool = setting(False, "Put several examples into one row; none sees another.")
 
 
@@ -134,7 +134,7 @@ class AlignSettings(ModelSettings):
         None, "Adapt kl_beta towards this KL per response, in nats (Ziegler: 6); none: fixed.", above=0
     )
     kl_horizon: float = setting(10_000.0, "Responses over which kl_beta adapts.", above=0)
-    kl_budget: float | None = setting(None, "Stop at this KL per response, in nats; none: go on.", above=0)
+    kl_budget: float | None = setting(None, "Stop at this KL per response, in nats; none: continue.", above=0)
 
     critic: str = setting(
         "head",
@@ -166,7 +166,7 @@ class AlignSettings(ModelSettings):
     ptx_data: str | None = setting(None, "Texts of the pretraining loss.")
     ptx_per_response: int = setting(1, "Pretraining texts per response (InstructGPT: 8).", at_least=1)
     reward_timeout: float | None = setting(
-        60.0, "Seconds a reward function may take; its samples are left out then. none: forever.", above=0
+        60.0, "Seconds a reward function may take; its samples are left out then. none: no limit.", above=0
     )
     max_rollbacks: int = setting(
         0,
@@ -222,7 +222,7 @@ class AlignSettings(ModelSettings):
         biased = self.kl not in ("k1-reward", "exact-split", "k2-loss", "exact-loss")
         if biased and not self.allow_biased_kl:
             raise ValueError(
-                f"kl {self.kl!r} has a gradient that is not the KL's. Use k1-reward or exact-split, or say "
+                f"kl {self.kl!r} has a gradient that is not the KL's. Use k1-reward or exact-split, or give "
                 "--allow-biased-kl to see what it does."
             )
         if self.ptx_weight and self.ptx_data is None:
@@ -235,7 +235,7 @@ class AlignSettings(ModelSettings):
 
     @property
     def logp_alone(self) -> bool:
-        """Whether log p is all of the head's work that is trained on, and the head itself is not."""
+        """Whether training needs only log p from the head, and the head itself is not trained."""
         return self.tune == "lora" and not self.exact_in_loss and not self.update.entropy_weight
 
     @property
@@ -244,7 +244,7 @@ class AlignSettings(ModelSettings):
         return self.update.minibatch_size >= self.batch_size and self.update.micro_batch_size is None
 
     def risks(self) -> list[str]:
-        """What is unusual about these settings and why it is risky; they are run as asked all the same."""
+        """What is unusual about these settings and why it is risky; training starts all the same."""
         found = []
         if self.kl_beta == 0 and self.kl_budget is None:
             found.append(
