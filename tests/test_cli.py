@@ -16,29 +16,24 @@ from typing import Any
 
 import pytest
 
-from tightrope.cli import main as cli
-from tightrope.algorithms.settings import range_text
 from tightrope.cli import display, flags, options
-from tightrope.control.settings import (
-    ALGORITHM_SETTINGS,
-    TrainSettings,
-    settings_from_json,
-    settings_to_json,
-    values_from_json,
-)
+from tightrope.cli.main import main
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+from tightrope.settings.fields import range_text
 from tightrope.training.events import Evaluated, Finished, Listeners, Started, Updated
 
 ALGORITHMS = list(ALGORITHM_SETTINGS)
 
 
 def run_main(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    code = cli.main(list(words))
+    code = main(list(words))
     captured = capsys.readouterr()
     return code, captured.out, captured.err
 
 
 def resolved(*words: str) -> tuple[str, dict[str, Any]]:
-    return options.overrides(*options.train_options(list(words)))
+    _, values = options.training_options("train", list(words))
+    return values.pop("env"), values
 
 
 # ---------------------------------------------------------------------------- the flags
@@ -46,7 +41,7 @@ def resolved(*words: str) -> tuple[str, dict[str, Any]]:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_setting_is_a_flag_with_doc_range_and_default(algorithm: str) -> None:
-    parser = options.train_parser(algorithm)
+    parser = options.training_parser("train", algorithm)
     text = " ".join(parser.format_help().split())
     known = parser.flags()
     for kind in (TrainSettings, ALGORITHM_SETTINGS[algorithm]):
@@ -66,13 +61,13 @@ def test_every_setting_is_a_flag_with_doc_range_and_default(algorithm: str) -> N
 )
 def test_every_option_has_help_and_fits_100_columns(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    parser = options.train_parser(make) if isinstance(make, str) else make()
+    parser = options.training_parser("train", make) if isinstance(make, str) else make()
     assert all(action.help for action in parser._actions)
     assert max(map(len, parser.format_help().splitlines())) <= 100
 
 
 def test_every_setting_stands_in_a_named_group() -> None:
-    assert "more" not in options.train_parser().format_help().split("\n\n")
+    assert "more" not in options.training_parser("train").format_help().split("\n\n")
     listed = [name for names in options.GROUPS.values() for name in names]
     assert sorted(listed) == sorted(flags.settings_fields(TrainSettings))
 
@@ -106,7 +101,7 @@ def test_flags_say_every_setting_and_return_it(algorithm: str, changed: bool) ->
         else {}
     )
     settings = TrainSettings().with_values(algorithm=algorithm, **values)
-    data = settings_to_json(settings)
+    data = settings.to_json()
     words = as_words(TrainSettings, data) + as_words(ALGORITHM_SETTINGS[algorithm], data["update"])
     env, said = resolved("Task-v0", *words)
     assert env == "Task-v0"
@@ -118,7 +113,7 @@ def test_a_settings_file_runs_again_and_flags_win(tmp_path: Path, algorithm: str
     settings = TrainSettings(env="Task-v0").with_values(
         algorithm=algorithm, gamma=0.9, hidden=(8, 8), num_workers=3
     )
-    (tmp_path / "settings.json").write_text(json.dumps(settings_to_json(settings)))
+    (tmp_path / "settings.json").write_text(json.dumps(settings.to_json()))
     for path in (tmp_path, tmp_path / "settings.json"):
         env, values = resolved("--settings", str(path))
         assert TrainSettings(env=env).with_values(**values) == settings
@@ -128,7 +123,7 @@ def test_a_settings_file_runs_again_and_flags_win(tmp_path: Path, algorithm: str
 
 
 def test_another_update_rule_leaves_the_files_own_settings(tmp_path: Path) -> None:
-    data = settings_to_json(TrainSettings().with_values(clip=0.1, gamma=0.9, num_envs=4))
+    data = TrainSettings().with_values(clip=0.1, gamma=0.9, num_envs=4).to_json()
     (tmp_path / "settings.json").write_text(json.dumps(data))
     _, values = resolved("--settings", str(tmp_path), "--algorithm", "a2c")
     assert values["algorithm"] == "a2c"
@@ -150,9 +145,9 @@ def test_only_what_is_given_overrides_the_preset() -> None:
 def test_dry_run_prints_the_settings_and_stops(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     os.chdir(tmp_path)
     code, out, _ = run_main(capsys, "train", "CartPole-v1", "--dry-run", "--clip", "0.1", "--seed", "5")
-    settings = settings_from_json(json.loads(out))
+    settings = TrainSettings.from_json(json.loads(out))
     assert (code, settings.env, settings.seed) == (0, "CartPole-v1", 5)
-    assert settings_to_json(settings)["update"]["clip"] == 0.1
+    assert settings.to_json()["update"]["clip"] == 0.1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -187,7 +182,7 @@ def test_the_settings_of_another_command_are_refused(
         for other in {"sft", "reward", "align"} - {command}:
             code, _, err = run_main(capsys, other, "--settings", str(tmp_path), "--dry-run")
             assert code == 2 and f"the settings of {command}, expected those of {other}" in err
-    (tmp_path / "settings.json").write_text(json.dumps(settings_to_json(TrainSettings())))
+    (tmp_path / "settings.json").write_text(json.dumps(TrainSettings().to_json()))
     code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
     assert code == 2 and "the settings of train" in err
 
@@ -218,9 +213,9 @@ def test_what_was_an_object_or_code_is_named_again(
 def test_a_language_settings_file_is_checked(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for values, message in (
         ({"batch_sise": 3}, "Did you mean 'batch_size'"),
-        ({"batch_size": "8"}, "batch_size is '8'; expected int"),
+        ({"batch_size": "8"}, "batch_size is '8' (str); expected int"),
         ({"update": 3}, "update is 3"),
-        ([], "holds list"),
+        ([], "the settings are list"),
     ):
         (tmp_path / "settings.json").write_text(json.dumps(values))
         code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
@@ -234,9 +229,7 @@ def test_a_flag_that_gathers_may_be_repeated() -> None:
 
 
 def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
-    from tightrope.cli.language import _align_parser
-
-    text = " ".join(_align_parser().format_help().split())
+    text = " ".join(options.training_parser("align").format_help().split())
     assert "without its normalisation of rewards" in text
     assert "without its language-modelling loss on correct responses" in text
     ziegler = shown(capsys, "align", "--recipe", "ziegler2019")
@@ -255,7 +248,7 @@ def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> 
         ({"num_env": 3}, "Did you mean 'num_envs'"),
         ({"update": {"clipp": 3}}, "Did you mean 'clip'"),
         ({"algorithm": "a2c", "update": {"clip": 0.2}}, "A2CSettings has no setting named 'clip'"),
-        ({"num_envs": "8"}, "num_envs is '8'; expected int"),
+        ({"num_envs": "8"}, "num_envs is '8' .str.; expected int"),
         ({"num_envs": 8.0}, "expected int"),
         ({"num_envs": True}, "expected int"),
         ({"num_envs": None}, "expected int"),
@@ -263,17 +256,17 @@ def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> 
         ({"hidden": [64, "64"]}, "whole numbers"),
         ({"hidden": 64}, "whole numbers"),
         ({"update": {"gamma": "0.9"}}, "expected float"),
-        ({"update": {"target_kl": False}}, "expected float or null"),
+        ({"update": {"target_kl": False}}, "expected float or None"),
         ({"update": {"gamma": 1.5}}, "gamma is 1.5"),
     ],
 )
 def test_a_settings_file_is_checked(data: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        settings_from_json(data)
+        TrainSettings.from_json(data)
 
 
 def test_numbers_without_a_point_are_floats_where_floats_are_due() -> None:
-    values = values_from_json({"update": {"gamma": 1}})
+    values = TrainSettings.values_from_json({"update": {"gamma": 1}})
     assert type(values["gamma"]) is float
 
 
@@ -331,7 +324,7 @@ def test_a_wrong_flag_is_answered_with_the_right_one(
 
 
 def test_every_peer_name_leads_to_a_real_flag() -> None:
-    known = {flag for algorithm in ALGORITHMS for flag in options.train_parser(algorithm).flags()}
+    known = {flag for algorithm in ALGORITHMS for flag in options.training_parser("train", algorithm).flags()}
     for name, meant in flags.PEER_NAMES.items():
         assert meant.replace("_", "-").split()[0] in known
         assert name.replace("_", "-") not in known
@@ -395,11 +388,11 @@ def test_a_folder_that_is_not_empty_is_not_used(capsys: pytest.CaptureFixture[st
 def test_an_error_inside_other_code_keeps_its_traceback() -> None:
     fake_training(lambda settings, run_dir, report: int("this is a bug, not a user's mistake"))
     with pytest.raises(ValueError, match="a bug"):
-        cli.main(["train", "CartPole-v1"])
+        main(["train", "CartPole-v1"])
 
 
 def test_a_file_never_names_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    data = settings_to_json(TrainSettings(env="evil_module:Task-v0"))
+    data = TrainSettings(env="evil_module:Task-v0").to_json()
     (tmp_path / "settings.json").write_text(json.dumps(data))
     code, _, err = run_main(capsys, "train", "--settings", str(tmp_path))
     assert code == 2
@@ -462,7 +455,7 @@ def a_run(folder: Path, stop_at: int | None = None) -> Any:
 
     def train(settings: TrainSettings, run_dir: str | None, listeners: Any) -> dict[str, Any]:
         report = Listeners(listeners)
-        with Run.create(folder / "run", settings_to_json(settings), "name") as run:
+        with Run.create(folder / "run", settings.to_json(), "name") as run:
             report.warn("clip is high")
             report(Started(str(run.path), SETTINGS, 0, 1000, ("engine: fused",)))
             for update in range(1, 101):

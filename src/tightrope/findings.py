@@ -1,4 +1,4 @@
-"""What a check found, as ``tightrope doctor`` prints it."""
+"""The result of a check, as ``tightrope doctor`` prints it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at: what, whether it is as it should be, what was seen, what to do if not."""
+    """One check: its subject, whether it passed, what was seen, and what to do if it failed."""
 
     what: str
     good: bool

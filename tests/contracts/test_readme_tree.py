@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from source_tree import ROOT, SRC, blocks, files, name_of, pages, sources
+from source_tree import ROOT, blocks, files, name_of, pages, sources
 
 
 def listed(text: str) -> dict[str, str]:

@@ -18,6 +18,7 @@ DECLARED_IN = {
     SRC / name
     for name in (
         "algorithms/settings.py",
+        "settings/fields.py",
         "control/settings.py",
         "control/presets.py",
         "cli/options.py",

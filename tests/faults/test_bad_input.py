@@ -241,7 +241,7 @@ def test_predict_refuses_a_mask_that_forbids_everything():
     [
         ({"gamma": "0.9"}, "expected float"),
         ({"hidden": 64}, "tuple"),
-        ({"n_steps": 5}, "Did you mean num_steps"),
+        ({"n_steps": 5}, "Did you mean 'num_steps'"),
     ],
 )
 def test_python_settings_of_the_wrong_kind_are_named(values, words):

@@ -215,7 +215,7 @@ def test_trl_reward_functions_run_unchanged(folder, tmp_path):
         ({"reward": (letters, float("nan"))}, "finite"),
         ({"kl": "k3-reward"}, "allow-biased-kl"),
         ({"learning_rte": 1.0}, "learning_rate"),
-        ({"init_kl_coef": 0.1}, "Did you mean kl_beta"),
+        ({"init_kl_coef": 0.1}, "Did you mean 'kl_beta'"),
         ({"model": "no such model"}, "no such model"),
         ({"lora_layers": 9}, "layers"),
         ({"minibatch_size": 0}, "minibatch_size"),

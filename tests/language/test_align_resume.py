@@ -195,7 +195,7 @@ def test_a_negative_seed_of_sampling_is_refused(whole):
         sample_run(whole.path, seed=-1)
 
 
-@pytest.mark.parametrize("name", ["settings_from_json", "_require_what_no_file_gives", "Trainer"])
+@pytest.mark.parametrize("name", ["AlignSettings.from_json", "_require_what_no_file_gives", "Trainer"])
 def test_a_run_that_somebody_writes_is_refused_before_its_settings_are_looked_at(
     tmp_path, whole, monkeypatch, name
 ):
@@ -204,7 +204,7 @@ def test_a_run_that_somebody_writes_is_refused_before_its_settings_are_looked_at
     def looked(*_: Any, **__: Any) -> Any:
         raise AssertionError("looked at before the lock was ours")
 
-    monkeypatch.setattr(alignment, name, looked)
+    monkeypatch.setattr(f"{alignment.__name__}.{name}", looked)
     with Run.open(run).lock(), pytest.raises(RunInUse, match="this process"):
         resume_align(run, **GIVEN)
     with pytest.raises(AssertionError, match="looked at"):

@@ -1,4 +1,4 @@
-"""What a command tells when a run was stopped: the newest checkpoint and how to go on."""
+"""The message of a command whose run was stopped: the newest checkpoint and how to resume."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from tightrope.runs.signals import Stopped
 
 
 def farewell(error: BaseException, run: str | None, step: int, what: str, command: str) -> str:
-    """What to tell of a ``run`` (None: not begun) that was stopped at ``step``: its newest valid checkpoint,
-    what will be repeated, and the ``command`` that goes on. ``what`` is counted: steps, responses.
+    """The message for a ``run`` (None: not begun) that was stopped at ``step``: its newest valid checkpoint,
+    what will be repeated, and the ``command`` that resumes it. ``what`` is counted: steps, responses.
     """
     by = f" by {error}" if isinstance(error, Stopped) else ""
     if run is None:
         return f"Stopped{by} before the run began."
     text = f"Stopped{by} at {what.removesuffix('s')} {step:,}. "
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of damaged ones the command that goes on will tell
+        warnings.simplefilter("ignore")  # `resume` reports damaged checkpoints
         folder = newest(run)
     if folder is None:
         text += f"There is no checkpoint yet: all {step:,} {what} will be repeated."

@@ -1,14 +1,13 @@
-"""Command line flags made from settings: one option a field, and an answer to every name that is not one."""
+"""Command line flags made from settings, one for each field, and suggestions for unknown flags."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 from collections.abc import Callable, Iterable
-from types import NoneType, UnionType
-from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
+from typing import Any, NoReturn
 
-from tightrope.algorithms.settings import range_text
+from tightrope.settings.fields import kinds, range_text
 from tightrope.settings.peer_names import PEER_NAMES
 
 WIDTH = 100
@@ -45,8 +44,7 @@ class Parser(argparse.ArgumentParser):
     ) -> dict[str, Any]:
         """The options given, and only those. ``--num_envs`` is read as ``--num-envs``.
 
-        ``unknown(name, flags)`` words the answer to a flag that is not there; `unknown_flag` is the usual
-        one.
+        ``unknown(name, flags)`` gives the error text for an unknown flag (default: `unknown_flag`).
         """
         words = [with_dashes(word) for word in words]
         known = self.flags()
@@ -58,7 +56,7 @@ class Parser(argparse.ArgumentParser):
         return vars(self.parse_args(words))
 
     def _refuse_repeated(self, words: list[str]) -> None:
-        """UsageError for a flag that stands twice, on or off, unless it gathers what it is given."""
+        """UsageError for a flag that is given twice, on or off, unless its values are collected in a list."""
         names = {s: action for action in self._actions for s in action.option_strings}
         seen: dict[str, str] = {}
         for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
@@ -95,9 +93,7 @@ def nearest(word: str, choices: Iterable[str], cutoff: float = 0.6) -> str | Non
 
 
 def unknown_flag(name: str, known: list[str]) -> str:
-    """The answer to a flag that does not exist: a peer's name for one that does, another spelling, a near
-    one.
-    """
+    """The error text for an unknown flag, with a suggestion."""
     meant = suggestion(name, known)
     return f"There is no flag --{name}." + (
         f" Did you mean --{meant}?" if meant else " --help lists them all."
@@ -105,7 +101,9 @@ def unknown_flag(name: str, known: list[str]) -> str:
 
 
 def suggestion(name: str, known: list[str]) -> str | None:
-    """What a flag was probably meant to be, without its dashes; None when nothing comes near."""
+    """The flag that was probably meant, without its dashes: another library's name, another spelling, or a
+    similar one; None when nothing is near.
+    """
     negated, name = name.startswith("no-"), name.removeprefix("no-").replace("-", "_").lower()
     british = name.replace("ize", "ise")
     peer = PEER_NAMES.get(name) or PEER_NAMES.get(name.rstrip("_"))
@@ -116,30 +114,25 @@ def suggestion(name: str, known: list[str]) -> str | None:
 
 
 def settings_fields(kind: type) -> dict[str, dataclasses.Field[Any]]:
-    """The fields of a settings class that are flags: those with a help text, by name."""
-    return {
-        f.name: f for f in dataclasses.fields(kind) if "doc" in f.metadata and f.name not in ("env", "update")
-    }
+    """The fields of a settings class that are flags, by name."""
+    return {f.name: f for f in dataclasses.fields(kind) if f.init and f.name not in ("env", "update")}
 
 
 def add_fields(group: Any, kind: type, names: Iterable[str]) -> None:
-    """One option a field: doc, range and default are its help, the class's annotation is its type."""
-    fields, hints = settings_fields(kind), get_type_hints(kind)
+    """One option a field: its help is made from doc, range and default."""
+    fields = settings_fields(kind)
     for name in names:
-        field, hint = fields[name], hints[name]
-        kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
-        optional, first = NoneType in kinds, kinds[0]
+        field, (plain, optional) = fields[name], kinds(kind)[name]
         flag, text = "--" + name.replace("_", "-"), help_text(field, optional)
-        if first is bool:
+        if plain is bool:
             group.add_argument(
                 flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text
             )
-        elif get_origin(first) is tuple:
+        elif plain is tuple:
             group.add_argument(flag, nargs="*", type=width, metavar="N", help=text)
         else:
-            choices = field.metadata.get("choices")
-            metavar = "WORD" if choices or first is str else "N" if first is int else "X"
-            plain = str if get_origin(first) is Literal else first
+            choices = field.metadata["choices"]
+            metavar = {str: "WORD", int: "N", float: "X"}[plain]
             group.add_argument(flag, type=reader(plain, optional, choices), metavar=metavar, help=text)
 
 
@@ -161,7 +154,7 @@ def help_text(field: dataclasses.Field[Any], optional: bool) -> str:
     return text.replace("%", "%%")
 
 
-def reader(kind: type, optional: bool, choices: tuple[str, ...] | None) -> Callable[[str], Any]:
+def reader(kind: type, optional: bool, choices: tuple[str, ...]) -> Callable[[str], Any]:
     """A function from a word on the command line to a value of ``kind``; ``none`` where that is allowed."""
 
     def read(word: str) -> Any:
@@ -184,7 +177,7 @@ def reader(kind: type, optional: bool, choices: tuple[str, ...] | None) -> Calla
 
 
 def width(word: str) -> int:
-    """One entry of a list of whole numbers; a task swallowed by the list is told where to go."""
+    """One entry of a list of whole numbers. The error explains that the task comes before the list."""
     try:
         return whole(word)
     except ValueError:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import os
 import shlex
 import sys
@@ -11,50 +9,39 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tightrope.cli.flags import Parser, UsageError, add_fields, settings_fields
+from tightrope.cli.flags import Parser, UsageError
 from tightrope.cli.options import (
+    KINDS,
     OWN_FIELDS,
     PROGRAM,
     at_least_one,
-    file_values,
+    dry_run,
     output,
     print_json,
-    settings_option,
+    run_parser,
+    training_options,
 )
-from tightrope.language.settings import (
-    NOT_HERE,
-    RECIPES,
-    AlignSettings,
-    ModelSettings,
-    RewardSettings,
-    RLHFSettings,
-    SFTSettings,
-)
+from tightrope.language.settings import AlignSettings
 
 NEEDED = "The language story needs transformers. Install it with: pip install 'tightrope[language]'"
 
 
 def sft(words: list[str]) -> int:
     """``tightrope sft``: supervised fine-tuning."""
-    given = _parser(
-        "sft", SFTSettings, "Fine-tune a causal language model on text, completions or chats."
-    ).read(words)
-    return _supervised("sft", SFTSettings, given)
+    return _supervised("sft", words)
 
 
 def reward(words: list[str]) -> int:
     """``tightrope reward``: a reward model from preference pairs."""
-    given = _parser(
-        "reward", RewardSettings, "Train a reward model on pairs of a better and a worse text."
-    ).read(words)
-    return _supervised("reward", RewardSettings, given)
+    return _supervised("reward", words)
 
 
-def _supervised(name: str, kind: type, given: dict[str, Any]) -> int:
-    settings = kind(**file_values(name, given.get("settings"), _values(given)), **_values(given))
-    if _dry_run(settings, given):
+def _supervised(name: str, words: list[str]) -> int:
+    given, values = training_options(name, words)
+    settings = KINDS[name]().with_values(**values)
+    if dry_run(settings, given):
         return 0
-    if not settings.data:
+    if not values.get("data"):
         raise UsageError(f"What to learn from? Give --data FILE.jsonl: {PROGRAM} {name} --data FILE.jsonl")
     train, _, columns = _stage(name)
 
@@ -80,12 +67,9 @@ def _stage(name: str) -> tuple[Callable[..., dict[str, Any]], Callable[..., dict
 
 def align(words: list[str]) -> int:
     """``tightrope align``: PPO against any reward."""
-    given = _align_parser().read(words)
-    recipe = RECIPES[given["recipe"]].values if "recipe" in given else {}
-    flags = _values(given)
-    values = {**file_values("align", given.get("settings"), flags), **recipe, **flags}
+    given, values = training_options("align", words)
     settings = AlignSettings().with_values(**values)
-    if _dry_run(settings, given):
+    if dry_run(settings, given):
         return 0
     for name, example in (("data", "--data PROMPTS.jsonl"), ("reward", "--reward length")):
         if not getattr(settings, name):
@@ -139,12 +123,9 @@ def _resume_supervised(name: str, given: dict[str, Any]) -> int:
 
 def sample(words: list[str]) -> int:
     """``tightrope sample RUN``: responses of the aligned model beside the reference's."""
-    parser = Parser(
-        f"{PROGRAM} sample",
-        "%(prog)s RUN [options]",
-        "Responses of the aligned model beside the reference's.",
+    parser = run_parser(
+        "sample", "Responses of the aligned model beside the reference's.", "Run folder of align."
     )
-    parser.add_argument("run", metavar="RUN", help="Run folder of align.")
     group = parser.add_argument_group("sampling")
     group.add_argument(
         "--prompt", action="append", metavar="TEXT", help="A prompt of your own; may be repeated."
@@ -215,65 +196,6 @@ def doctor(words: list[str]) -> int:
             if not finding.good:
                 print(f"     {finding.advice}")
     return 0 if all(finding.good for finding in findings) else 1
-
-
-# ---------------------------------------------------------------------------- options
-
-
-def _parser(name: str, kind: type, description: str) -> Parser:
-    parser = Parser(f"{PROGRAM} {name}", "%(prog)s --model M --data FILE [options]", description)
-    shared = [field.name for field in dataclasses.fields(ModelSettings)]
-    own = [name for name in settings_fields(kind) if name not in shared]
-    add_fields(parser.add_argument_group("data and training"), kind, own)
-    add_fields(parser.add_argument_group("model and machine"), kind, shared)
-    _run_options(parser)
-    return parser
-
-
-def _align_parser() -> Parser:
-    parser = Parser(
-        f"{PROGRAM} align",
-        "%(prog)s --model M --data PROMPTS --reward R [options]",
-        "PPO on a causal language model against any reward.",
-        "Recipes: " + "; ".join(f"{name} ({recipe.source})" for name, recipe in RECIPES.items()),
-    )
-    fields = list(settings_fields(AlignSettings))
-    shared = [field.name for field in dataclasses.fields(ModelSettings)]
-    add_fields(
-        parser.add_argument_group("alignment"), AlignSettings, [name for name in fields if name not in shared]
-    )
-    inner = [name for name in settings_fields(RLHFSettings) if name not in NOT_HERE]
-    add_fields(parser.add_argument_group("update rule: ppo"), RLHFSettings, inner)
-    add_fields(parser.add_argument_group("model and machine"), AlignSettings, shared)
-    _run_options(parser)
-    group = parser.add_argument_group("recipes and judges")
-    group.add_argument(
-        "--recipe", choices=tuple(RECIPES), metavar="NAME", help=f"One of: {', '.join(RECIPES)}."
-    )
-    return parser
-
-
-def _run_options(parser: Parser) -> None:
-    group = parser.add_argument_group("run")
-    group.add_argument(
-        "--run-dir", metavar="FOLDER", help="Where the run lies (default runs/COMMAND-MODEL-TIME)."
-    )
-    settings_option(group)
-    group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
-    output(parser)
-
-
-NOT_SETTINGS = ("run_dir", "settings", "dry_run", "json", "quiet", "recipe")
-
-
-def _values(given: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in given.items() if name not in NOT_SETTINGS}
-
-
-def _dry_run(settings: Any, given: dict[str, Any]) -> bool:
-    if given.get("dry_run"):
-        print(json.dumps(dataclasses.asdict(settings), indent=None if given.get("json") else 2))
-    return bool(given.get("dry_run"))
 
 
 def _require_transformers() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import sys
@@ -15,14 +14,13 @@ from tightrope.cli.flags import UsageError, nearest
 from tightrope.cli.options import (
     PROGRAM,
     Options,
+    dry_run,
     evaluate_parser,
-    overrides,
     print_json,
     record_parser,
     resume_parser,
-    train_options,
+    training_options,
 )
-from tightrope.control.settings import settings_to_json
 from tightrope.runs.records import printable
 
 # ---------------------------------------------------------------------------- commands
@@ -30,14 +28,15 @@ from tightrope.runs.records import printable
 
 def train(words: list[str]) -> int:
     """``tightrope train ENV``: resolve the settings, train, print how it went."""
-    given, file_values = train_options(words)
-    env, values = overrides(given, file_values)
+    given, values = training_options("train", words)
+    env = values.pop("env", None)
+    if env is None:
+        raise UsageError("Which task? Give a Gymnasium id: tightrope train CartPole-v1")
     _import_named(given.get("env_module"))
     from tightrope.control.resolve import resolve
 
     settings = resolve(env, values.pop("algorithm", "ppo"), values)
-    if given.get("dry_run"):
-        print(json.dumps(settings_to_json(settings), indent=None if given.get("json") else 2))
+    if dry_run(settings, given):
         return 0
 
     def run(report: Any) -> dict[str, Any]:
@@ -84,12 +83,9 @@ def evaluate(words: list[str]) -> int:
     if given.get("json"):
         print_json(result)
     else:
-        low, high = _interval(result)
-        count = result["episodes"]
-        print(
-            f"mean return {result['mean_return']:.2f}, deviation {result['std_return']:.2f}, {count} episodes"
-        )
-        print(f"95 % interval of the mean: {low:.2f} to {high:.2f}")
+        mean, half_width, count = (result[name] for name in ("mean_return", "ci95", "episodes"))
+        print(f"mean return {mean:.2f}, deviation {result['std_return']:.2f}, {count} episodes")
+        print(f"95 % interval of the mean: {mean - half_width:.2f} to {mean + half_width:.2f}")
     return 0
 
 
@@ -228,16 +224,6 @@ def _command(name: str, run: str, given: Options) -> str:
     if ":" in given.get("env", ""):
         words += ["--env", given["env"]]
     return shlex.join(words)
-
-
-def _interval(result: dict[str, Any]) -> tuple[float, float]:
-    """The 95 % interval, from its two ends or from its half width."""
-    ci = result["ci95"]
-    return (
-        (ci[0], ci[1])
-        if isinstance(ci, list | tuple)
-        else (result["mean_return"] - ci, result["mean_return"] + ci)
-    )
 
 
 def _help() -> str:

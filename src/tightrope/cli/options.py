@@ -1,9 +1,11 @@
-"""The options of each command, and what flags and a settings file together say about a training run."""
+"""The options of each command, and the settings that a file and flags together give."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,14 @@ from tightrope.cli.flags import (
     whole,
     with_dashes,
 )
-from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings, typed_values, values_from_json
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+from tightrope.language.settings import RECIPES, AlignSettings, ModelSettings, RewardSettings, SFTSettings
 from tightrope.runs.records import retyped
+from tightrope.settings.values import Settings, rule_of
 
 PROGRAM = "tightrope"
 
-# Which flags stand together in --help; a field in no group is listed under "more".
+# The groups of train --help; every setting is in one.
 GROUPS = {
     "task": ("algorithm", "total_steps", "seed"),
     "rollout": ("num_envs", "num_steps", "normalise_observations", "normalise_rewards"),
@@ -40,7 +44,38 @@ GROUPS = {
 }
 
 Options = dict[str, Any]
-# a setting that tells a command's settings.json from the others'
+KINDS: dict[str, type[Settings]] = {
+    "train": TrainSettings,
+    "sft": SFTSettings,
+    "reward": RewardSettings,
+    "align": AlignSettings,
+}
+NOT_SETTINGS = ("run_dir", "settings", "dry_run", "json", "quiet", "recipe", "env_module")
+# usage, description and the text below the options
+DESCRIPTIONS: dict[str, tuple[str, str, str | None]] = {
+    "train": (
+        "ENV",
+        "Train a policy on a Gymnasium task, and leave a run folder with everything about it.",
+        "Defaults shown are those of an unknown task; presets change some of them for the tasks they know. "
+        "--dry-run prints what holds. Each setting may be given after a settings file, too: the flag wins.",
+    ),
+    "sft": (
+        "--model M --data FILE",
+        "Fine-tune a causal language model on text, completions or chats.",
+        None,
+    ),
+    "reward": (
+        "--model M --data FILE",
+        "Train a reward model on pairs of a better and a worse text.",
+        None,
+    ),
+    "align": (
+        "--model M --data PROMPTS --reward R",
+        "PPO on a causal language model against any reward.",
+        "Recipes: " + "; ".join(f"{name} ({recipe.source})" for name, recipe in RECIPES.items()),
+    ),
+}
+# the setting by which the settings.json of a command is recognised
 OWN_FIELDS = {"sft": "on_completions", "reward": "demonstrations", "align": "max_new_tokens", "train": "env"}
 
 
@@ -60,11 +95,11 @@ def output(parser: Parser) -> None:
     group.add_argument("--quiet", action="store_true", help="Print the end only.")
 
 
-def settings_option(group: Any) -> None:
-    """The option that begins with the settings of another run."""
-    group.add_argument(
-        "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
-    )
+def dry_run(settings: Settings, given: Options) -> bool:
+    """Whether --dry-run was given; then the settings are printed."""
+    if given.get("dry_run"):
+        print(json.dumps(settings.to_json(), indent=None if given.get("json") else 2))
+    return bool(given.get("dry_run"))
 
 
 def _common(parser: Parser, *, run: bool) -> None:
@@ -84,47 +119,65 @@ def _common(parser: Parser, *, run: bool) -> None:
         )
 
 
-def train_parser(algorithm: str = "ppo") -> Parser:
-    """The options of ``train`` with this update rule."""
-    parser = Parser(
-        f"{PROGRAM} train",
-        "%(prog)s ENV [options]",
-        "Train a policy on a Gymnasium task, and leave a run folder with everything about it.",
-        "Defaults shown are those of an unknown task; presets change some of them for the tasks they know. "
-        "--dry-run prints what holds. Each setting may be given after a settings file, too: the flag wins.",
-    )
-    parser.add_argument("env", nargs="?", metavar="ENV", help="Gymnasium id, like CartPole-v1.")
-    fields = settings_fields(TrainSettings)
-    listed = {name for names in GROUPS.values() for name in names}
-    groups = {**GROUPS, "more": tuple(name for name in fields if name not in listed)}
-    for title, names in groups.items():
-        if title == "update rule":
-            kind = ALGORITHM_SETTINGS[algorithm]
+def training_parser(command: str, algorithm: str = "ppo") -> Parser:
+    """The options of a command that trains; those of ``train`` with this update rule."""
+    usage, description, epilog = DESCRIPTIONS[command]
+    kind = KINDS[command]
+    parser = Parser(f"{PROGRAM} {command}", f"%(prog)s {usage} [options]", description, epilog)
+    if command == "train":
+        parser.add_argument("env", nargs="?", metavar="ENV", help="Gymnasium id, like CartPole-v1.")
+    for title, names in _groups(command).items():
+        rule = rule_of(kind, algorithm) if title == "update rule" else None
+        if rule is None:
+            add_fields(parser.add_argument_group(title), kind, names)
+        else:
             others = ", ".join(name for name in ALGORITHM_SETTINGS if name != algorithm)
-            group = parser.add_argument_group(
-                f"update rule: {algorithm}", f"For those of {others}: --algorithm NAME --help."
-            )
-            add_fields(group, kind, settings_fields(kind))
-        elif names:
-            add_fields(parser.add_argument_group(title), TrainSettings, names)
+            hint = f"For those of {others}: --algorithm NAME --help." if command == "train" else None
+            group = parser.add_argument_group(f"update rule: {algorithm}", hint)
+            add_fields(group, rule, settings_fields(rule))
+    folder = "ENV-ALGORITHM-SEED-TIME" if command == "train" else "COMMAND-MODEL-TIME"
     group = parser.add_argument_group("run")
+    group.add_argument("--run-dir", metavar="FOLDER", help=f"Where the run lies (default runs/{folder}).")
     group.add_argument(
-        "--run-dir", metavar="FOLDER", help="Where the run lies (default runs/ENV-ALGORITHM-SEED-TIME)."
+        "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
     )
-    settings_option(group)
     group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
-    _common(parser, run=False)
+    if command == "train":
+        _common(parser, run=False)
+    else:
+        output(parser)
+    if command == "align":
+        parser.add_argument_group("recipes and judges").add_argument(
+            "--recipe", choices=tuple(RECIPES), metavar="NAME", help=f"One of: {', '.join(RECIPES)}."
+        )
+    return parser
+
+
+def _groups(command: str) -> Mapping[str, Iterable[str]]:
+    """The titles of --help and the settings under each."""
+    if command == "train":
+        return GROUPS
+    shared = settings_fields(ModelSettings)
+    first = [name for name in settings_fields(KINDS[command]) if name not in shared]
+    if command == "align":
+        return {"alignment": first, "update rule": (), "model and machine": shared}
+    return {"data and training": first, "model and machine": shared}
+
+
+def run_parser(
+    command: str, description: str, folder: str = "Run folder, or a folder that agent.save wrote."
+) -> Parser:
+    """The beginning of a command about a run: its name, and the argument RUN with ``folder`` as its help."""
+    parser = Parser(f"{PROGRAM} {command}", "%(prog)s RUN [options]", description)
+    parser.add_argument("run", metavar="RUN", help=folder)
     return parser
 
 
 def evaluate_parser() -> Parser:
     """The options of ``evaluate``."""
-    parser = Parser(
-        f"{PROGRAM} evaluate",
-        "%(prog)s RUN [options]",
-        "Play episodes with the saved policy of a run: mean return, deviation, 95 % interval.",
+    parser = run_parser(
+        "evaluate", "Play episodes with the saved policy of a run: mean return, deviation, 95 % interval."
     )
-    parser.add_argument("run", metavar="RUN", help="Run folder, or a folder that agent.save wrote.")
     group = parser.add_argument_group("evaluation")
     group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 100).")
     group.add_argument(
@@ -141,12 +194,7 @@ def evaluate_parser() -> Parser:
 
 def record_parser() -> Parser:
     """The options of ``record``."""
-    parser = Parser(
-        f"{PROGRAM} record",
-        "%(prog)s RUN [options]",
-        "Write an mp4 of the saved policy of a run; no display is needed.",
-    )
-    parser.add_argument("run", metavar="RUN", help="Run folder, or a folder that agent.save wrote.")
+    parser = run_parser("record", "Write an mp4 of the saved policy of a run; no display is needed.")
     group = parser.add_argument_group("recording")
     group.add_argument("--out", metavar="FILE.mp4", help="Where to (default RUN/videos/).")
     group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 1).")
@@ -163,12 +211,9 @@ def record_parser() -> Parser:
 
 def resume_parser() -> Parser:
     """The options of ``resume``."""
-    parser = Parser(
-        f"{PROGRAM} resume",
-        "%(prog)s RUN [options]",
-        "Go on with a run from its newest checkpoint, in the same folder.",
+    parser = run_parser(
+        "resume", "Go on with a run from its newest checkpoint, in the same folder.", "Run folder."
     )
-    parser.add_argument("run", metavar="RUN", help="Run folder.")
     group = parser.add_argument_group("going on")
     group.add_argument(
         "--total-steps",
@@ -214,19 +259,36 @@ def _bounded(word: str, low: int) -> int:
     return number
 
 
-def train_options(words: list[str]) -> tuple[Options, Options]:
-    """What the flags say and what the settings file says; the update rule decides which flags there are."""
+def training_options(command: str, words: list[str]) -> tuple[Options, Options]:
+    """The options given, and the value of each setting that --settings, --recipe or a flag names. Flags win
+    over the recipe, the recipe over the file.
+    """
     words = [with_dashes(word) for word in words]
     path = _value_of("--settings", words)
-    file_values = values_from_json(read_settings(path)) if path else {}
-    algorithm = _value_of("--algorithm", words) or file_values.get("algorithm", "ppo")
+    of_file = _values_of_file(command, path) if path else {}
+    algorithm = "ppo"
+    if command == "train":
+        algorithm = _value_of("--algorithm", words) or of_file.get("algorithm", "ppo")
     if algorithm not in ALGORITHM_SETTINGS:
         algorithm = "ppo"  # the parser words the error
-    given = train_parser(algorithm).read(words, lambda name, known: _unknown_setting(name, known, algorithm))
-    if file_values.get("algorithm", algorithm) != algorithm:  # the settings of another update rule do not fit
+
+    def unknown(name: str, known: list[str]) -> str:
+        return _unknown_setting(name, known, algorithm) if command == "train" else unknown_flag(name, known)
+
+    given = training_parser(command, algorithm).read(words, unknown)
+    if of_file.get("algorithm", algorithm) != algorithm:  # the settings of another update rule do not fit
         outer = settings_fields(TrainSettings).keys() | {"env"}
-        file_values = {name: value for name, value in file_values.items() if name in outer}
-    return given, file_values
+        of_file = {name: value for name, value in of_file.items() if name in outer}
+    recipe = RECIPES[given["recipe"]].values if "recipe" in given else {}
+    flags = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in given.items()
+        if name not in NOT_SETTINGS
+    }
+    for name, value in of_file.items():
+        if name not in flags:
+            _refuse_code(command, str(path), name, value)
+    return given, {**of_file, **recipe, **flags}
 
 
 def _value_of(flag: str, words: list[str]) -> str | None:
@@ -239,7 +301,7 @@ def _value_of(flag: str, words: list[str]) -> str | None:
 
 
 def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
-    """The answer to an unknown flag of train; one that another update rule has is said to be that."""
+    """The error text for an unknown flag of train. It names the update rule that has the flag, if one has."""
     own = " ".join("--" + field.replace("_", "-") for field in settings_fields(ALGORITHM_SETTINGS[algorithm]))
     for other, kind in ALGORITHM_SETTINGS.items():
         flags = [field.replace("_", "-") for field in settings_fields(kind)]
@@ -255,7 +317,7 @@ def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
 
 
 def read_settings(path: str) -> Any:
-    """What a settings.json holds, given as the file or as the folder of its run. UsageError for neither."""
+    """What a settings.json holds, given as a file or as the folder of a run. UsageError if there is none."""
     from tightrope.runs.records import read_json
     from tightrope.runs.signed import unsigned
 
@@ -267,64 +329,28 @@ def read_settings(path: str) -> Any:
     return unsigned(found) if isinstance(found, dict) else found
 
 
-def overrides(given: Options, file_values: Options) -> tuple[str, Options]:
-    """The task, and every setting that the file or a flag names (the flag wins)."""
-    names = settings_fields(TrainSettings).keys() | {
-        n for k in ALGORITHM_SETTINGS.values() for n in settings_fields(k)
-    }
-    flags = {name: value for name, value in given.items() if name in names}
-    flags = {name: tuple(value) if isinstance(value, list) else value for name, value in flags.items()}
-    values = {**file_values, **flags}
-    env_of_file = values.pop("env", None)
-    env = given.get("env") or env_of_file
-    if env is None:
-        raise UsageError("Which task? Give a Gymnasium id: tightrope train CartPole-v1")
-    if "env" not in given and ":" in env:
-        raise UsageError(
-            f"The settings file names the task {env!r}, whose module would be imported. Code is named by you "
-            f"and never by a file: {PROGRAM} train {retyped(env, 'ID')} --settings FILE"
-        )
-    return env, values
-
-
-def file_values(name: str, path: str | None, flags: Options) -> Options:
-    """What --settings of a language command says that no flag does, names and types checked; nothing without.
-
-    UsageError for the settings of another command, and for what a file cannot hold and no flag gives again:
-    an object, or code, which is named by the user alone.
-    """
-    from tightrope.language.settings import NOT_HERE, AlignSettings, RewardSettings, RLHFSettings, SFTSettings
-
-    if path is None:
-        return {}
-    kinds = {"sft": SFTSettings, "reward": RewardSettings, "align": AlignSettings}
+def _values_of_file(command: str, path: str) -> Options:
+    """The values in a settings file, names and types checked. UsageError for those of another command."""
     data = read_settings(path)
-    if not isinstance(data, dict):
-        raise UsageError(f"--settings {path} holds {type(data).__name__}, expected an object with settings.")
-    own = next((command for command, field in OWN_FIELDS.items() if field in data), name)
-    if own != name:
+    fields = data if isinstance(data, dict) else {}
+    other = next((name for name, field in OWN_FIELDS.items() if field in fields), command)
+    if other != command:
         raise UsageError(
-            f"--settings {path} holds the settings of {own}, expected those of {name}. Give settings.json "
-            f"of a run of {name}, or type: {PROGRAM} {own} --settings {path}"
+            f"--settings {path} holds the settings of {other}, expected those of {command}. Give "
+            f"settings.json of a run of {command}, or type: {PROGRAM} {other} --settings {path}"
         )
-    inner = data.pop("update", {}) if name == "align" else {}
-    if not isinstance(inner, dict):
-        raise UsageError(f"--settings {path}: update is {inner!r}, expected an object with settings.")
-    values = typed_values(data, kinds[name])
-    values |= typed_values({key: x for key, x in inner.items() if key not in NOT_HERE}, RLHFSettings)
-    values = {key: x for key, x in values.items() if key not in flags}
-    for key, value in values.items():
-        if _must_be_named(key, value):
-            word = "FILE.py:function" if key in ("reward", "gold") else "FILE"
-            raise UsageError(
-                f"--settings {path}: {key} was {value!r}, which no file may name: an object, code, or a "
-                f"folder that is gone. Give it again: {PROGRAM} {name} --settings {shlex.quote(path)} "
-                f"--{key.replace('_', '-')} {retyped(value, word)}"
-            )
-    return values
+    return KINDS[command].values_from_json(data, f"--settings {path}")
 
 
-def _must_be_named(key: str, value: Any) -> bool:
-    """Whether a setting stands for a Python object, or for code, which no file may name."""
-    judge = key in ("reward", "gold") and value not in (None, "", "length") and not Path(value).is_dir()
-    return judge or (isinstance(value, str) and value.startswith("<"))
+def _refuse_code(command: str, path: str, name: str, value: Any) -> None:
+    """UsageError for a value that only the user may give: a Python object or code."""
+    judge = name in ("reward", "gold") and value not in (None, "", "length") and not Path(value).is_dir()
+    module = name == "env" and ":" in value
+    if judge or module or (isinstance(value, str) and value.startswith("<")):
+        word = "FILE.py:function" if name in ("reward", "gold") else "ID" if name == "env" else "FILE"
+        flag = "" if name == "env" else f"--{name.replace('_', '-')} "
+        raise UsageError(
+            f"--settings {path}: {name} was {value!r}, which no file may name: an object, code, or a "
+            f"folder that is gone. Give it again: {PROGRAM} {command} --settings {shlex.quote(path)} "
+            f"{flag}{retyped(value, word)}"
+        )

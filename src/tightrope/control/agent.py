@@ -34,7 +34,7 @@ from tightrope.control.resolve import resolve
 from tightrope.control.rollout.advantages import to_batch
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.rollout import Rollout
-from tightrope.control.settings import TrainSettings, settings_to_json
+from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import ObservationLayout
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint
@@ -258,7 +258,7 @@ class Agent:
         if normalisers:
             tensors["normalisers"] = normalisers
         state = {
-            "settings": settings_to_json(self.settings),
+            "settings": self.settings.to_json(),
             "steps": self.steps,
             "kl_beta": self.kl_beta,
             "rollbacks": self.rollbacks,

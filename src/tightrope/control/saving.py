@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.control.agent import AGENTS, Agent, anywhere
-from tightrope.control.settings import TrainSettings, settings_from_json
+from tightrope.control.settings import TrainSettings
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
 from tightrope.runs.history import Checkpoint
@@ -32,7 +32,7 @@ def load(
     """
     folder, tensors, state = read(Path(path), best=best)
     with checkpoint.understood(folder):
-        settings, own_policy = settings_from_json(state["settings"]), bool(state["own_policy"])
+        settings, own_policy = TrainSettings.from_json(state["settings"]), bool(state["own_policy"])
         own_environment = bool(state["own_environment"]) or ":" in settings.env
     if device is not None and device != settings.device:
         settings = settings.with_values(device=device, engine="auto")

@@ -13,7 +13,7 @@ from tightrope.control.environments.make import Environments
 from tightrope.control.evaluate import EVALUATION_SEED, evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
 from tightrope.control.saving import name_again, rebuild
-from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
+from tightrope.control.settings import TrainSettings
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
@@ -46,7 +46,7 @@ def train(
     agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=told.tell)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
-    with contextlib.closing(agent), Run.create(run_dir, settings_to_json(settings), name) as run:
+    with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name) as run:
         learner = AgentLearner(agent, run, told)
         if agent.policy.own is not None or not isinstance(source, str):
             # settings.json alone could not give these first weights again
@@ -78,7 +78,7 @@ def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy
     point = newest_point(run, told)
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
-        settings = settings_from_json(run.settings if point is None else state["settings"])
+        settings = TrainSettings.from_json(run.settings if point is None else state["settings"])
         own_environment = bool(state.get("own_environment")) or ":" in settings.env
         own_policy = bool(state.get("own_policy"))
     if env is None and own_environment:
@@ -147,7 +147,7 @@ class AgentLearner:
 
     def settings_json(self) -> dict[str, Any]:
         """The content of settings.json."""
-        return settings_to_json(self.settings)
+        return self.settings.to_json()
 
     def changeable(self) -> Any:
         """The settings of which some can be changed during the run: the update rule's."""

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from tightrope.language.alignment.align import settings_from_json
 from tightrope.language.alignment.samples import read_samples
 from tightrope.language.data.examples import Prompt, read_prompts
 from tightrope.language.data.padding import pad_left
@@ -33,7 +32,7 @@ def sample_run(
     ``seed`` of sampling: by default the run's + 1. Raises ValueError where there is no finished run.
     """
     path = Path(path)
-    settings = settings_from_json(Run.open(path).settings)
+    settings = AlignSettings.from_json(Run.open(path).settings, path / "settings.json")
     if seed is not None and seed < 0:
         raise ValueError(f"seed is {seed}, expected 0 or more.")
     if not (path / "model" / "config.json").is_file():

@@ -1,4 +1,4 @@
-"""What other libraries call the settings: the only place where their names stand."""
+"""Other libraries' names for the settings; the only file that uses them."""
 
 # Names of stable-baselines3, CleanRL, TRL, RLlib and rl_games, and what the same thing is called here.
 PEER_NAMES = {

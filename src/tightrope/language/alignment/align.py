@@ -15,7 +15,7 @@ from typing import Any
 from tightrope.language.alignment.iteration import Trainer
 from tightrope.language.alignment.kl import bias_of
 from tightrope.language.quiet import quiet
-from tightrope.language.settings import NOT_HERE, AlignSettings
+from tightrope.language.settings import AlignSettings
 from tightrope.language.supervised.prepare import threads
 from tightrope.runs.records import retyped
 from tightrope.runs.run import Run
@@ -116,7 +116,7 @@ def resume_align(
     file too. ``total_episodes`` extends a finished run.
     """
     with Run.open(run_dir, own=True) as run:
-        settings = settings_from_json(run.settings)
+        settings = AlignSettings.from_json(run.settings, run.path / "settings.json")
         if total_episodes is not None:
             settings = settings.with_values(total_episodes=total_episodes)
         _require_what_no_file_gives(run_dir, settings, prompts, reward, gold)
@@ -166,17 +166,3 @@ def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
         trainer.listeners.info(text)
     trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
     continue_from(trainer, run, point)
-
-
-def settings_from_json(data: dict[str, Any]) -> AlignSettings:
-    """The settings of an alignment run's settings.json. ValueError for another command's, or unknown
-    names.
-    """
-    inner = data.get("update")
-    if not isinstance(inner, dict) or "max_new_tokens" not in data:
-        raise ValueError("These are not the settings of an alignment run.")
-    outer = {name: value for name, value in data.items() if name != "update"}
-    own = {name: value for name, value in inner.items() if name not in NOT_HERE}
-    if twice := sorted(set(outer) & set(own)):
-        raise ValueError(f"The settings name {', '.join(twice)} twice, outside and inside update.")
-    return AlignSettings().with_values(**outer, **own)

@@ -140,7 +140,7 @@ class Trainer:
 
     def settings_json(self) -> dict[str, Any]:
         """The content of settings.json."""
-        return dataclasses.asdict(self.settings)
+        return self.settings.to_json()
 
     def changeable(self) -> Any:
         """The settings of which some can be changed during the run: the update rule's."""

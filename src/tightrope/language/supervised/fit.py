@@ -20,12 +20,12 @@ from torch import Tensor, nn
 from tightrope.algorithms.memory import Parts
 from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam, Brake, Meter
-from tightrope.algorithms.settings import scheduled
 from tightrope.language.data.split import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.history import Checkpoint
 from tightrope.runs.run import Run
+from tightrope.settings.fields import scheduled
 from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors, put_back, tensors_of
 
@@ -101,7 +101,7 @@ class SupervisedLearner:
 
     def settings_json(self) -> dict[str, Any]:
         """The content of settings.json."""
-        return dataclasses.asdict(self.settings)
+        return self.settings.to_json()
 
     def changeable(self) -> SupervisedSettings:
         """The settings of which some can be changed during the run."""

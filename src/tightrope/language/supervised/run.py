@@ -5,7 +5,6 @@ Files are read again when a run is resumed; an object in Python must be given ag
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,7 +34,7 @@ def recorded(settings: Settings, **given: Any) -> Settings:
         for name, value in given.items()
         if value is not None
     }
-    return dataclasses.replace(settings, **names)
+    return settings.with_values(**names)
 
 
 def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[Run, Settings]:
@@ -53,9 +52,7 @@ def reopened(kind: type[Settings], run_dir: str | Path, **given: Any) -> tuple[R
 
 
 def _settings_again(kind: type[Settings], run: Run, run_dir: str | Path, given: dict[str, Any]) -> Settings:
-    unknown = sorted(set(run.settings) - {field.name for field in dataclasses.fields(kind)})
-    if unknown:
-        raise ValueError(f"{run_dir} has settings that {kind.__name__} has not: {', '.join(unknown)}.")
+    settings = kind.from_json(run.settings, run.path / "settings.json")
     for name, value in given.items():
         if value is None and str(run.settings.get(name)).startswith("<"):
             word = shlex.quote(str(run_dir))
@@ -64,7 +61,7 @@ def _settings_again(kind: type[Settings], run: Run, run_dir: str | Path, given: 
                 f"The {name} of {run_dir} was {run.settings[name]}, an object that no file holds. Give it "
                 f"again: {name}=... in Python{command}."
             )
-    return recorded(kind(**run.settings), **given)
+    return recorded(settings, **given)
 
 
 def train_supervised(
