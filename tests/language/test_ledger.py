@@ -8,6 +8,7 @@ import torch
 from transformers import AutoModelForCausalLM, GPT2Config, LlamaConfig
 
 from tightrope.algorithms.optimise import Adam
+from tightrope.language.generation.sample import cached_forward
 from tightrope.language.memory import sizes as shapes
 from tightrope.language.memory.ledger import (
     DoesNotFit,
@@ -20,8 +21,8 @@ from tightrope.language.memory.ledger import (
     ledger,
 )
 from tightrope.language.model import lora
-from tightrope.language.model.kv_cache import cached_forward
-from tightrope.language.model.load import parts, without_dropout
+from tightrope.language.model.load import without_dropout
+from tightrope.language.model.parts import parts
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SFTSettings
 
 LLAMA = LlamaConfig(

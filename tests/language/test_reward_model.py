@@ -11,10 +11,11 @@ import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
 from tightrope.algorithms.optimise import Brake
+from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Pair, preference_pairs
-from tightrope.language.data.padding import pad_left, pad_right
 from tightrope.language.model import lora
-from tightrope.language.model.load import load_causal, parts
+from tightrope.language.model.load import load_causal
+from tightrope.language.model.parts import parts
 from tightrope.language.reward.model import SHIFT, RewardModel, last_real, load_reward
 from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised.fit import Objective, take_step

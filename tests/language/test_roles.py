@@ -10,10 +10,11 @@ from language.tiny import saved
 from tightrope.algorithms import ppo
 from tightrope.algorithms.optimise import make_optimiser
 from tightrope.language.alignment.experience import gather, rewards_of, to_batch
+from tightrope.language.data import batching
+from tightrope.language.data.batching import length_groups, used_columns
 from tightrope.language.data.examples import Prompt
 from tightrope.language.model import lora
-from tightrope.language.policy import policy_model
-from tightrope.language.policy.policy_model import PolicyModel, length_groups, trimmed
+from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import make_roles
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings, RLHFSettings
@@ -109,7 +110,7 @@ def test_the_pass_of_the_rollout_is_kept_only_where_one_pass_is_an_epoch(folder,
     assert not present.with_values(micro_batch_size=6).one_pass
     roles = fresh(present)
     assert gather(roles, PROMPTS, 1, 0, 2).said is None
-    monkeypatch.setattr(policy_model, "PASS", 0)  # then every length is worth a group
+    monkeypatch.setattr(batching, "PASS", 0)  # then every length is worth a group
     assert gather(roles, PROMPTS, 1, 0, 2, keep=True).said is None
 
 
@@ -201,7 +202,7 @@ def poison(batch, name):
 
 def test_trimmed_keeps_every_state_that_is_asked_for():
     real = torch.tensor([[0, 0, 1, 1, 1, 0, 0], [0, 1, 1, 1, 1, 1, 0]]).bool()
-    assert trimmed(real, real[:, 4:]) == (1, 5)
+    assert used_columns(real, real[:, 4:]) == (1, 5)
 
 
 def test_rows_of_different_lengths_go_in_groups_of_like_ones():
@@ -218,8 +219,8 @@ def test_groups_change_neither_statistics_nor_gradients(folder, monkeypatch):
     roles, _, _, batch = experienced(settings(folder, critic="separate"))
     found = []
     for most, overhead in ((1, 64), (4, 0)):
-        monkeypatch.setattr(policy_model, "MOST_GROUPS", most)
-        monkeypatch.setattr(policy_model, "PASS", overhead)
+        monkeypatch.setattr(batching, "MOST_GROUPS", most)
+        monkeypatch.setattr(batching, "PASS", overhead)
         groups = len(length_groups(batch.inputs["real"], batch.mask))
         assert (groups > 1) == (most > 1)
         now = PolicyModel(roles)(batch)

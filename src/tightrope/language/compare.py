@@ -13,11 +13,12 @@ import torch
 
 from tightrope.language.alignment.align import settings_from_json
 from tightrope.language.alignment.samples import read_samples
+from tightrope.language.data.batching import pad_left
 from tightrope.language.data.examples import Prompt, read_prompts
-from tightrope.language.data.padding import pad_left
 from tightrope.language.generation.distribution import Sampling
 from tightrope.language.generation.sample import sample
-from tightrope.language.model.load import eos_ids, find_model, load_causal, load_tokenizer
+from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer
+from tightrope.language.model.packaged import find_model
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.run import Run

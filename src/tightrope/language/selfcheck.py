@@ -13,11 +13,10 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser
 from tightrope.findings import Finding
 from tightrope.language.alignment.experience import Experience, gather, rewards_of, to_batch
+from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Prompt
-from tightrope.language.data.padding import pad_left, pad_right
-from tightrope.language.generation.distribution import Sampling
+from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import log_ratio_limit
-from tightrope.language.generation.token_stats import token_statistics
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.quiet import quiet

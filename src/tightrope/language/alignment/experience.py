@@ -14,13 +14,12 @@ from torch import Tensor
 
 from tightrope.algorithms.batch import Batch
 from tightrope.language.alignment.kl import kl_rewards
+from tightrope.language.data.batching import length_groups, pad_left
 from tightrope.language.data.examples import Prompt
-from tightrope.language.data.padding import pad_left
-from tightrope.language.generation.completions import Answers
-from tightrope.language.generation.sample import Responses, sample
-from tightrope.language.generation.token_stats import token_statistics
+from tightrope.language.generation.distribution import token_statistics
+from tightrope.language.generation.sample import Completions, Responses, sample
 from tightrope.language.memory.exhausted import advising_on_memory
-from tightrope.language.policy.policy_model import Said, length_groups
+from tightrope.language.policy.policy_model import Said
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings
@@ -29,7 +28,7 @@ from tightrope.maths.statistics import masked_mean, masked_sum, masked_variance
 
 
 @dataclass
-class Experience(Answers):
+class Experience(Completions):
     """Responses and what the roles say of them.
 
     ``logp``, ``ref_logp``, ``entropy``, ``exact`` (KL of the state), ``values``: [B, R]. ``final_values``
@@ -71,7 +70,7 @@ class PromptOrder:
 
 
 @advising_on_memory
-def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Answers:
+def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Completions:
     """``samples`` responses of the policy to each prompt; rows of one prompt are neighbours."""
     settings, begin = roles.settings, time.perf_counter()
     device = next(roles.model.parameters()).device
@@ -84,7 +83,7 @@ def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, 
         )
     tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
     real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
-    return Answers(tokens, real, responses, time.perf_counter() - begin, lower=None)
+    return Completions(tokens, real, responses, time.perf_counter() - begin, lower=None)
 
 
 @advising_on_memory

@@ -34,9 +34,10 @@ from tightrope.language.alignment.monitor import Monitor
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.alignment.samples import sample_rows
 from tightrope.language.alignment.state import save_model, save_state, updates
-from tightrope.language.data.examples import Prompt, hold_out, read_prompts, read_rows
+from tightrope.language.data.examples import Prompt, hold_out_prompts, read_prompts, read_rows
 from tightrope.language.generation.sample import log_ratio_limit
-from tightrope.language.model.load import context_length, find_model
+from tightrope.language.model.packaged import find_model
+from tightrope.language.model.parts import context_length
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.reward.call import RewardError
@@ -93,7 +94,7 @@ class Trainer:
         self.gold: Judge | None = None
         if gold is not None:
             self.gold = make_judge(gold, self.roles, on_trunk=None, timeout=settings.reward_timeout)
-            self.prompts, self.held_out = hold_out(self.prompts, settings.held_out_prompts)
+            self.prompts, self.held_out = hold_out_prompts(self.prompts, settings.held_out_prompts)
         if settings.critic_from_reward:
             critic_from_reward(self.judge, self.roles, reward)
         self.optimiser = make_optimiser(

@@ -15,8 +15,8 @@ import numpy as np
 
 from tightrope.language.data.examples import Prompt
 from tightrope.language.model import lora
-from tightrope.language.model.load import find_model
-from tightrope.language.model.saving import write_model
+from tightrope.language.model.lora import write_model
+from tightrope.language.model.packaged import find_model
 from tightrope.language.policy.roles import Roles
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.checkpoint import understood

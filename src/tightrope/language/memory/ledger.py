@@ -18,10 +18,9 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 
-from tightrope.language.generation.token_stats import CHUNK
+from tightrope.language.generation.distribution import CHUNK
 from tightrope.language.memory.sizes import Shapes, shapes_of
-from tightrope.language.model.load import fused
-from tightrope.language.model.reading import pretrained, without_weights
+from tightrope.language.model.load import fused, pretrained, without_weights
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SupervisedSettings
 
 Phase = Literal["always", "rollout", "update"]

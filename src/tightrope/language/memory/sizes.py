@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.load import Parts, fused, parts
-from tightrope.language.model.reading import without_weights
+from tightrope.language.model.load import fused, without_weights
+from tightrope.language.model.parts import Parts, parts
 
 LENGTHS = (16, 32, 48)  # tokens at which a forward pass is measured, evenly spaced
 

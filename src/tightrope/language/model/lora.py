@@ -19,9 +19,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.load import parts
-from tightrope.language.model.reading import read_object, read_tensors
-from tightrope.runs.durable import writing
+from tightrope.language.model.load import read_object, read_tensors
+from tightrope.language.model.parts import parts
+from tightrope.runs.durable import whole, writing
 
 
 class Switch:
@@ -283,3 +283,13 @@ def load_adapter(model: Any, name: str, folder: Path) -> None:
         )
     add_adapter(model, name, rank, float(alpha), tuple(layers))
     load_adapter_state(model, name, state)
+
+
+def write_model(model: Any, tokenizer: Any, folder: Path, adapter: str | None) -> None:
+    """Any transformers model with one adapter folded in, and its tokenizer, as safetensors; whole or absent.
+    Raises CannotWrite.
+    """
+    state = {key: tensor.cpu() for key, tensor in merged_state(model, adapter).items()}
+    with whole(folder) as temporary:
+        model.save_pretrained(temporary, state_dict=state)
+        tokenizer.save_pretrained(temporary)

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.data.padding import positions
+from tightrope.language.data.batching import positions
 from tightrope.language.model import lora
-from tightrope.language.model.load import WINDOWS, parts
+from tightrope.language.model.parts import WINDOWS, parts
 
 FINAL_NORMS = ("norm", "ln_f", "final_layer_norm")
 NARROW = 3  # tokens of a window while the halves are tried

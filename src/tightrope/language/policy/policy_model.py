@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms.batch import Batch, Evaluation
-from tightrope.language.generation.token_stats import token_statistics
+from tightrope.language.data.batching import length_groups, used_columns
+from tightrope.language.generation.distribution import token_statistics
 from tightrope.language.policy.roles import Roles
 
-MOST_GROUPS, PASS = 4, 64
 Said = tuple[
     Tensor, Tensor, Tensor, Tensor
 ]  # of all rows [B, R]: log p, entropy, KL to the reference, values
@@ -53,7 +53,7 @@ class PolicyModel:
         """Log-probabilities, entropies, KL to the reference and values of some rows, each [b, R]."""
         roles, mask = self.roles, part.mask
         columns, length = mask.shape[1], part.inputs["tokens"].shape[1]
-        left, right = trimmed(part.inputs["real"], mask)
+        left, right = used_columns(part.inputs["real"], mask)
         tokens, real = (part.inputs[name][:, left:right] for name in ("tokens", "real"))
         lower = part.inputs["lower"][:, left:right] if "lower" in part.inputs else None
         first = length - columns - left - 1  # the state in which the first response token is chosen
@@ -81,38 +81,6 @@ class PolicyModel:
         return logp, entropy, kl, values
 
 
-def length_groups(real: Tensor, mask: Tensor) -> list[Tensor]:
-    """Rows [B] of about one length each, in as many groups as make the padded passes cheapest.
-
-    A group costs its rows times the longest prompt and the longest response among them, and a pass PASS
-    tokens more, however small it is.
-    """
-    prompts = real[:, : real.shape[1] - mask.shape[1]].sum(1)
-    places = torch.arange(1, mask.shape[1] + 1, device=mask.device)
-    responses = torch.where(mask, places, 0).amax(1)
-    order = (prompts + responses).argsort(stable=True)
-    sizes = torch.stack([prompts, responses])[:, order].cpu()
-
-    def cost(groups: int) -> int:
-        parts = sizes.tensor_split(groups, dim=1)
-        return sum(part.shape[1] * int(part.amax(1).sum()) + PASS for part in parts)
-
-    fewest = min(range(1, min(MOST_GROUPS, len(mask)) + 1), key=cost)
-    return list(order.tensor_split(fewest))
-
-
 def _spread(x: Tensor, mask: Tensor) -> Tensor:
     """[N] numbers of the counting steps -> [B, R], 0 elsewhere."""
     return torch.zeros(mask.shape, dtype=x.dtype, device=x.device).masked_scatter(mask, x)
-
-
-def trimmed(real: Tensor, mask: Tensor) -> tuple[int, int]:
-    """The columns [left, right) of [B, P + R] whose states matter: from the first real prompt token to the
-    token before the last counting one, in whose state that is chosen.
-    """
-    prompt = real.shape[1] - mask.shape[1]
-    any_prompt = real[:, :prompt].any(0).nonzero()
-    any_response = mask.any(0).nonzero()
-    left = int(any_prompt[0]) if len(any_prompt) else prompt - 1
-    right = prompt + (int(any_response[-1]) if len(any_response) else 0)
-    return left, right

@@ -20,16 +20,9 @@ from torch import Tensor, nn
 from tightrope.language.generation.distribution import Sampling
 from tightrope.language.memory.ledger import available_memory, check, job_of, ledger, reward_model_bytes
 from tightrope.language.model import lora
-from tightrope.language.model.load import (
-    eos_ids,
-    find_model,
-    load_causal,
-    load_tokenizer,
-    parameter_counts,
-    parts,
-    require_device,
-)
-from tightrope.language.model.reading import pretrained
+from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, require_device
+from tightrope.language.model.packaged import find_model
+from tightrope.language.model.parts import parameter_counts, parts
 from tightrope.language.model.trunk import Trunk
 from tightrope.language.settings import AlignSettings
 

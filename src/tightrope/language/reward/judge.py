@@ -14,10 +14,9 @@ from torch import Tensor
 
 from tightrope.algorithms.memory import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
-from tightrope.language.generation.completions import Answers
+from tightrope.language.generation.sample import Completions
 from tightrope.language.model import lora
-from tightrope.language.model.load import fingerprint
-from tightrope.language.model.reading import read_metadata, read_tensors
+from tightrope.language.model.load import fingerprint, read_metadata, read_tensors
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.call import Fault, RewardError
 from tightrope.language.reward.functions import Rewards, Scores, checked_weight, load_reward_function, unlike
@@ -42,7 +41,7 @@ class Judge:
         self.roles, self.functions, self.model, self.adapter = roles, functions, model, adapter
         self.weight = weight
 
-    def __call__(self, prompts: Sequence[Prompt], answers: Answers, trainer_state: Any = None) -> Scores:
+    def __call__(self, prompts: Sequence[Prompt], answers: Completions, trainer_state: Any = None) -> Scores:
         """Scores of the responses to ``prompts``, one prompt a response."""
         found = self._of_functions(prompts, answers, trainer_state)
         try:
@@ -59,7 +58,7 @@ class Judge:
         assert found is not None
         return found
 
-    def _of_functions(self, prompts: Sequence[Prompt], answers: Answers, state: Any) -> Scores | None:
+    def _of_functions(self, prompts: Sequence[Prompt], answers: Completions, state: Any) -> Scores | None:
         if self.functions is None:
             return None
         ids = answers.ids()
@@ -73,7 +72,7 @@ class Judge:
         return self.functions.score([p.shown for p in prompts], completions, ids, columns, state)
 
     @torch.no_grad()
-    def _of_model(self, answers: Answers) -> np.ndarray | None:
+    def _of_model(self, answers: Completions) -> np.ndarray | None:
         if self.model is None and self.adapter is None:
             return None
         size = self.roles.settings.update.micro_batch_size or len(answers.tokens)

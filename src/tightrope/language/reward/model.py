@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.data.padding import positions
-from tightrope.language.model.load import fused, load_tokenizer, without_dropout
-from tightrope.language.model.reading import pretrained, read_object
+from tightrope.language.data.batching import positions
+from tightrope.language.model.load import fused, load_tokenizer, pretrained, read_object, without_dropout
 from tightrope.language.quiet import quiet
 
 SHIFT = "tightrope_reward_shift"  # in config.json: score = what the head says - shift

@@ -22,7 +22,7 @@ from tightrope.algorithms.memory import Parts
 from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam, Brake, Meter
 from tightrope.algorithms.settings import scheduled
-from tightrope.language.data.split import Item
+from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.language.supervised.progress import Progress, load_progress, save_progress
 from tightrope.runs import signals

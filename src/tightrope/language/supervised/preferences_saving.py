@@ -11,8 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.model import lora
-from tightrope.language.model.load import fingerprint
-from tightrope.language.model.reading import without_weights
+from tightrope.language.model.load import fingerprint, without_weights
 from tightrope.language.reward.model import SHIFT
 from tightrope.language.supervised.prepare import Loaded
 from tightrope.runs.durable import whole
