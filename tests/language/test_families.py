@@ -8,7 +8,7 @@ from language.tiny import VOCABULARY, padded, saved
 
 from tightrope.algorithms.optimise import SamplingMismatch
 from tightrope.language import selfcheck
-from tightrope.language.alignment.checks import refuse_mismatch
+from tightrope.language.alignment.figures import refuse_mismatch
 from tightrope.language.data.batching import Example, collate, row_of
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample

@@ -92,13 +92,13 @@ def test_the_pass_of_the_rollout_is_the_first_of_the_update(folder, tune, critic
     part = to_batch(experience, experience.logp, torch.ones(6, dtype=torch.bool), roles.settings)
     part = part.select(torch.tensor([4, 0, 3]))
     found, weights = [], torch.linspace(-1, 1, part.mask.numel()).view(part.mask.shape)
-    for said in (experience.said, None):
-        model = PolicyModel(roles, exact=roles.settings.exact_in_loss, said=said)
+    for first_pass in (experience.first_pass, None):
+        model = PolicyModel(roles, exact=roles.settings.exact_in_loss, first_pass=first_pass)
         now = model(part)
         total = (now.logp * weights).sum() + now.values.square().sum()
-        total = total + model.kl.sum() if roles.settings.exact_in_loss else total
+        total = total + now.kl.sum() if roles.settings.exact_in_loss else total
         gradients = torch.autograd.grad(total, parameters, allow_unused=True, materialize_grads=True)
-        assert any(bool(g.any()) for g in gradients) and model.said is None
+        assert any(bool(g.any()) for g in gradients) and model.first_pass is None
         found.append([now.logp, now.values, *gradients])
     for kept, own in zip(*found, strict=True):
         torch.testing.assert_close(kept, own, rtol=1e-3, atol=2e-5)
@@ -109,9 +109,9 @@ def test_the_pass_of_the_rollout_is_kept_only_where_one_pass_is_an_epoch(folder,
     assert present.one_pass and not present.with_values(minibatch_size=5).one_pass
     assert not present.with_values(micro_batch_size=6).one_pass
     roles = fresh(present)
-    assert gather(roles, PROMPTS, 1, 0, 2).said is None
+    assert gather(roles, PROMPTS, 1, 0, 2).first_pass is None
     monkeypatch.setattr(batching, "PASS", 0)  # then every length is worth a group
-    assert gather(roles, PROMPTS, 1, 0, 2, keep=True).said is None
+    assert gather(roles, PROMPTS, 1, 0, 2, keep=True).first_pass is None
 
 
 def experienced_again(roles, batch):
@@ -127,7 +127,7 @@ def fresh(present):
 
 def gather_reference(roles, experience):
     lower = roles.trunk.lower(experience.tokens, experience.real)
-    return roles.reference_hidden(experience.tokens, experience.real, lower)
+    return roles.reference.hidden(experience.tokens, experience.real, lower)
 
 
 def test_the_lower_part_and_the_adapter_critic_change_nothing(folder):

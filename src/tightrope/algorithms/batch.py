@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -20,9 +20,13 @@ class Evaluation:
     entropy: Tensor
     values: Tensor
 
-    def within(self, mask: Tensor) -> Evaluation:
-        """The same with 0 outside the mask: what a model says of padding reaches no loss and no gradient."""
-        return Evaluation(*(torch.where(mask, x, 0.0) for x in (self.logp, self.entropy, self.values)))
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The same with every tensor changed by one function, those of a subclass included."""
+        return dataclasses.replace(self, **{name: change(x) for name, x in vars(self).items()})
+
+    def within(self, mask: Tensor) -> Self:
+        """The same with 0 outside the mask: what a model computes for padding reaches no gradient."""
+        return self.map(lambda x: torch.where(mask, x, 0.0))
 
 
 @dataclass(frozen=True)

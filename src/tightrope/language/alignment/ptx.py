@@ -58,7 +58,7 @@ class Pretraining:
             learn[row, : len(example.learn)] = torch.tensor(example.learn, device=device)
         with torch.no_grad():
             lower = self.roles.trunk.lower(tokens, real)
-        hidden = self.roles.policy_hidden(tokens, real, lower)
+        hidden = self.roles.policy.hidden(tokens, real, lower)
         targets = learn[:, 1:]
         found = token_statistics(
             hidden[:, :-1][targets], self.roles.trunk.parts.head, tokens[:, 1:][targets], Sampling()

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tightrope.language.data.examples import Prompt
-from tightrope.language.model import lora
-from tightrope.language.model.lora import write_model
 from tightrope.language.model.packaged import find_model
+from tightrope.language.model.saving import save_adapter, write_model
 from tightrope.language.policy.roles import Roles
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.checkpoint import understood
@@ -39,7 +38,7 @@ def save_model(roles: Roles, path: Path, settings: AlignSettings) -> None:
     write_model(roles.model, roles.tokenizer, path / "model", name)
     if name is not None:
         with whole(path / "adapter") as folder:
-            lora.save_adapter(roles.model, name, folder, base_model=find_model(settings.model))
+            save_adapter(roles.model, name, folder, base_model=find_model(settings.model))
 
 
 def _hash_of(prompts: Sequence[Prompt]) -> str:

@@ -17,6 +17,7 @@ from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions
 from tightrope.language.model import lora
 from tightrope.language.model.load import fingerprint, read_metadata, read_tensors
+from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.call import Fault, RewardError
 from tightrope.language.reward.functions import Rewards, Scores, checked_weight, load_reward_function, unlike
@@ -86,7 +87,7 @@ class Judge:
             assert self.adapter is not None
             head, shift = self.adapter
             lower = None if answers.lower is None else answers.lower[rows]
-            hidden = self.roles.adapter_hidden("reward", tokens, real, lower)
+            hidden = Role(self.roles.trunk, "reward").hidden(tokens, real, lower)
             scores.append((last_real(hidden, real).float() @ head.float().T)[:, 0] - shift)
         return torch.cat(scores).double().cpu().numpy()
 
@@ -234,7 +235,7 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
         model = judge.model or load_reward(folder)
         weight, shift = model.head.weight, model.shift
         try:
-            roles.critic.parts.base.load_state_dict(model.base.state_dict())
+            roles.critic.trunk.parts.base.load_state_dict(model.base.state_dict())
         except RuntimeError as error:
             raise ValueError(
                 f"critic_from_reward: the reward model {folder} is built otherwise than the critic, which is "

@@ -16,8 +16,8 @@ from tightrope.language.data.batching import Example, Packed, attention_of, coll
 from tightrope.language.data.examples import Row, hold_out, read_rows, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.model import lora
-from tightrope.language.model.lora import write_model
 from tightrope.language.model.parts import attention_window, parts
+from tightrope.language.model.saving import save_adapter, write_model
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, fit, micro_batches
@@ -158,7 +158,7 @@ def _train(
         write_model(model, loaded.tokenizer, run.path / "model", loaded.adapter)
         if loaded.adapter is not None:
             with whole(run.path / "adapter") as folder:
-                lora.save_adapter(model, loaded.adapter, folder, base_model=loaded.source)
+                save_adapter(model, loaded.adapter, folder, base_model=loaded.source)
         return finish(settings, run, report, final, rows=len(rows), held_out_rows=len(held), tokens=learnt)
 
 
