@@ -12,7 +12,7 @@ from tightrope.language.alignment.figures import refuse_mismatch
 from tightrope.language.data.batching import Example, collate, row_of
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample
-from tightrope.language.memory.ledger import Job, ledger, reward_model_bytes
+from tightrope.language.memory import Job, ledger, reward_model_bytes
 from tightrope.language.model import parts as parts_module
 from tightrope.language.model.load import load_causal
 from tightrope.language.model.parts import attention_window, parts

@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from tightrope.language.generation.distribution import Sampling
-from tightrope.language.memory.ledger import available_memory, check, job_of, ledger, reward_model_bytes
+from tightrope.language.memory import available_memory, check, job_of, ledger, reward_model_bytes
 from tightrope.language.model import lora
 from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, require_device
 from tightrope.language.model.packaged import find_model

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from tightrope.language.data.examples import Row, read_rows
-from tightrope.language.memory.ledger import available_memory, check, job_of, ledger
+from tightrope.language.memory import available_memory, check, job_of, ledger
 from tightrope.language.model import lora
 from tightrope.language.model.load import (
     eos_ids,
