@@ -340,3 +340,17 @@ RECIPES: dict[str, Recipe] = {
         "Yue et al. 2025, VAPO, arXiv 2504.05118; without its language-modelling loss on correct responses",
     ),
 }  # fmt: skip
+
+
+def settings_from_json(data: dict[str, Any]) -> AlignSettings:
+    """The settings of an alignment run's settings.json. ValueError for another command's, or unknown
+    names.
+    """
+    inner = data.get("update")
+    if not isinstance(inner, dict) or "max_new_tokens" not in data:
+        raise ValueError("These are not the settings of an alignment run.")
+    outer = {name: value for name, value in data.items() if name != "update"}
+    own = {name: value for name, value in inner.items() if name not in NOT_HERE}
+    if twice := sorted(set(outer) & set(own)):
+        raise ValueError(f"The settings name {', '.join(twice)} twice, outside and inside update.")
+    return AlignSettings().with_values(**outer, **own)

@@ -15,7 +15,7 @@ from tightrope.language.alignment.iteration import Aligned, Trainer
 from tightrope.language.alignment.kl import bias_of
 from tightrope.language.alignment.state import restore_state
 from tightrope.language.quiet import quiet
-from tightrope.language.settings import NOT_HERE, AlignSettings
+from tightrope.language.settings import AlignSettings, settings_from_json
 from tightrope.language.supervised.prepare import threads
 from tightrope.runs.history import steps_in
 from tightrope.runs.records import retyped
@@ -143,17 +143,3 @@ def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
     trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
     run.rewind(point)
     run.update_settings(dataclasses.asdict(settings))
-
-
-def settings_from_json(data: dict[str, Any]) -> AlignSettings:
-    """The settings of an alignment run's settings.json. ValueError for another command's, or unknown
-    names.
-    """
-    inner = data.get("update")
-    if not isinstance(inner, dict) or "max_new_tokens" not in data:
-        raise ValueError("These are not the settings of an alignment run.")
-    outer = {name: value for name, value in data.items() if name != "update"}
-    own = {name: value for name, value in inner.items() if name not in NOT_HERE}
-    if twice := sorted(set(outer) & set(own)):
-        raise ValueError(f"The settings name {', '.join(twice)} twice, outside and inside update.")
-    return AlignSettings().with_values(**outer, **own)
