@@ -20,7 +20,13 @@ from tightrope.language.model.load import fingerprint, read_metadata, read_tenso
 from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.call import Fault, RewardError
-from tightrope.language.reward.functions import Rewards, Scores, checked_weight, load_reward_function, unlike
+from tightrope.language.reward.functions import (
+    Rewards,
+    Scores,
+    checked_weight,
+    load_reward_function,
+    unique_name,
+)
 from tightrope.language.reward.model import RewardModel, last_real, load_reward
 
 
@@ -109,7 +115,7 @@ def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) ->
     alone = np.zeros(len(learnt), bool)
     alone[[sample for fault in found.faults if fault.kind == "none" for sample in fault.samples]] = True
     valid = (found.valid | alone) & good
-    part, name = np.where(good, learnt, np.nan), unlike(found.parts, "reward_model")
+    part, name = np.where(good, learnt, np.nan), unique_name(found.parts, "reward_model")
     faults = [fault for fault in found.faults if fault.kind != "none"]
     if not good.all():
         bad = tuple(np.flatnonzero(~good).tolist())
