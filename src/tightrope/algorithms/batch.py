@@ -20,13 +20,10 @@ class Evaluation:
     entropy: Tensor
     values: Tensor
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """The same with every tensor changed by one function, those of a subclass included."""
-        return dataclasses.replace(self, **{name: change(x) for name, x in vars(self).items()})
-
     def within(self, mask: Tensor) -> Self:
         """The same with 0 outside the mask: what a model computes for padding reaches no gradient."""
-        return self.map(lambda x: torch.where(mask, x, 0.0))
+        figures = {name: torch.where(mask, x, 0.0) for name, x in vars(self).items()}
+        return dataclasses.replace(self, **figures)  # a subclass keeps its own figures
 
 
 @dataclass(frozen=True)

@@ -209,12 +209,13 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
     """Advantages and returns of the responses whose score counts (``valid`` [B]), as ppo.update takes
     them.
     """
-    mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
+    mask, last = experience.responses.mask, experience.last
+    rows = torch.arange(len(mask))
     ended = torch.zeros_like(mask)
-    ended[rows, experience.last] = True
+    ended[rows, last] = True
     terminated = ended.clone()
     if settings.truncation == "bootstrap":
-        terminated[rows, experience.last] = experience.responses.ended
+        terminated[rows, last] = experience.responses.ended
     update, values = settings.update, experience.values
     if settings.critic == "none":
         advantages = leave_one_out(rewards, mask, valid, settings.samples_per_prompt, settings.update.gamma)
@@ -237,7 +238,8 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
             mask=mask,
         )
         advantages = estimate(gae_lambda=policy_lambda)
-        targets = estimate(gae_lambda=critic_lambda) + values
+        one_lambda = settings.lambda_alpha is None and critic_lambda == policy_lambda
+        targets = (advantages if one_lambda else estimate(gae_lambda=critic_lambda)) + values
     old = experience.responses.logp if settings.dtype == "float32" else experience.logp
     inputs = Inputs(
         tokens=experience.tokens,

@@ -33,13 +33,20 @@ def describe(
     log_ratio = torch.where(mask, experience.ref_logp - experience.logp, 0.0)
     total = scores.total[scores.valid]
     nan = float("nan")
-    k1, surprise = divergence.k1(log_ratio), -experience.logp
+    estimators = {
+        "objective/kl": divergence.k1,
+        "objective/kl_k2": divergence.k2,
+        "objective/kl_k3": divergence.k3,
+    }
+    kls = {name: estimate(log_ratio) for name, estimate in estimators.items()}
+    per_token = {
+        "objective/kl_token_mean": kls["objective/kl"],
+        "objective/entropy_token_mean": -experience.logp,
+    }
     per_response = {
-        "objective/kl": k1,
-        "objective/kl_k2": divergence.k2(log_ratio),
-        "objective/kl_k3": divergence.k3(log_ratio),
+        **kls,
         "objective/kl_exact": experience.exact,
-        "objective/entropy": surprise,
+        "objective/entropy": -experience.logp,
         "objective/entropy_exact": experience.entropy,
     }
     per_scored_response = {"objective/rlhf_reward": rewards, "objective/non_score_reward": kl_share}
@@ -51,8 +58,7 @@ def describe(
             name: float(masked_sum(x, counting)) / len(total) if len(total) else nan
             for name, x in per_scored_response.items()
         },
-        "objective/kl_token_mean": float(masked_mean(k1, mask)),
-        "objective/entropy_token_mean": float(masked_mean(surprise, mask)),
+        **{name: float(masked_mean(x, mask)) for name, x in per_token.items()},
         "objective/scores": float(np.mean(total)) if len(total) else nan,
         "objective/scores_std": float(np.std(total)) if len(total) else nan,
         "objective/response_length": float(mask.sum()) / len(mask),
@@ -85,7 +91,7 @@ def refuse_bad_numbers(experience: Experience, weights: Iterable[tuple[str, Tens
         ("value", experience.values),
     )
     mask = experience.responses.mask
-    found = first_bad((f"The {name} of response, token ", torch.where(mask, x, 0.0)) for name, x in figures)
+    found = first_bad([(f"The {name} of response, token ", torch.where(mask, x, 0.0)) for name, x in figures])
     if found is None:
         return
     weight = first_bad((f"the weight {name}", p) for name, p in weights)

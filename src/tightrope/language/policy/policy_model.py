@@ -38,7 +38,7 @@ class PolicyModel:
         """
         known, self.first_pass = self.first_pass, None  # a second call after memory ran out must not reuse it
         if known is not None:
-            return known.map(lambda x: x[part.inputs["row"]])
+            return FirstPass(**{name: x[part.inputs["row"]] for name, x in vars(known).items()})
         groups = length_groups(part.inputs["real"], part.mask)
         if len(groups) == 1:
             return self._pass(part)
