@@ -269,7 +269,7 @@ def check(found: Ledger, available: int | None) -> None:
 
 
 def _alternatives(job: Job) -> Iterator[tuple[str, Job]]:
-    """Each way to need less alone, then all of them together."""
+    """Each way to need less by itself, then all of them together."""
     fewer, half = max(1, job.micro_batch_size // 4), max(1, job.batch_size // 2)
     ways: dict[str, dict[str, Any]] = {
         f"--micro-batch-size {fewer}": {"micro_batch_size": fewer},

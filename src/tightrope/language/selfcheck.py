@@ -62,7 +62,7 @@ def _limit(roles: Roles) -> float:
 
 @torch.no_grad()
 def _same_logits(roles: Roles, experience: Experience) -> Finding:
-    """The bare trunk and its head beside what the model itself says, unpadded rows one at a time."""
+    """The bare trunk and its head beside the model's own logits, unpadded rows one at a time."""
     worst, head = 0.0, roles.trunk.parts.head
     for row, real in zip(experience.tokens, experience.real, strict=True):
         tokens = row[real][None]
@@ -83,7 +83,7 @@ def _same_policy(roles: Roles, experience: Experience) -> Finding:
     gap = float((experience.responses.logp - experience.logp)[mask].abs().max())
     return Finding(
         "sampling and training agree", gap <= _limit(roles), f"largest gap {gap:.1e} nats a token",
-        "The model says something else with its KV cache than without. Update transformers, or report the "
+        "The model computes other numbers with its KV cache than without. Update transformers, or report the "
         "model.",
     )  # fmt: skip
 

@@ -16,9 +16,9 @@ PASS = 64  # what a pass costs besides its tokens, in tokens
 
 @dataclass(frozen=True)
 class Example:
-    """One text to learn from: ``learn[i]`` tells whether token i is a target of the loss.
+    """One text to learn from: ``learn[i]`` is True where token i is a target of the loss.
 
-    The first token never is: nothing stands before it that could predict it.
+    The first token never is: nothing before it could predict it.
     """
 
     tokens: tuple[int, ...]

@@ -1,5 +1,5 @@
-"""Training data for language models: rows in, tokens and masks out. What counts is said by a mask, never by a
-token id.
+"""Training data for language models: rows in, tokens and masks out. A mask decides what counts,
+never a token id.
 
 Formats are TRL's: ``text``; ``prompt`` and ``completion``; ``messages``; ``prompt``, ``chosen`` and
 ``rejected``. Padding may be any id: no result depends on it.
@@ -176,7 +176,7 @@ def sft_examples(
     """Examples for supervised fine-tuning.
 
     ``{"text"}`` or a plain string: every token is learnt.  ``{"prompt", "completion"}``, strings or lists of
-    messages, and ``{"messages"}``: completions and assistant turns alone, or everything with
+    messages, and ``{"messages"}``: only completions and assistant turns, or everything with
     ``on_completions`` off. The EOS that closes a text or a reply is learnt, whatever PAD may be; where none
     is written, the first of ``eos`` is appended. Rows over ``max_tokens`` are cut at the end, rows with
     nothing left to learn are left out, and ``notify`` is told how many. ValueError names the row that is

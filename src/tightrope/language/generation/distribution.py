@@ -21,7 +21,7 @@ CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 
 @dataclass(frozen=True)
 class Sampling:
-    """How tokens are drawn: temperature, the k likeliest alone (0, or more than there are: all), tokens that
+    """How tokens are drawn: temperature, only the k likeliest (0, or more than there are: all), tokens that
     are never drawn.
     """
 
@@ -48,7 +48,7 @@ def shape_logits(
 
 
 def at_head(sampling: Sampling, head: nn.Linear) -> Sampling:
-    """How to draw from the head's own logits, so that the model's are drawn from as ``sampling`` says."""
+    """``sampling`` corrected for the factor between the head's output and the model's logits."""
     factor: float = getattr(head, FACTOR, 1.0)
     if factor == 1.0:
         return sampling

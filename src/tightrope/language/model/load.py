@@ -37,8 +37,8 @@ def require_device(device: str) -> None:
 
 
 def fingerprint(folder: str) -> str | None:
-    """A hash that tells weights apart: of the size and of 64 samples, 4 kB each, of every weight file in a
-    model folder; None where there is none.
+    """A hash that differs between weights: of the size and of 64 samples, 4 kB each, of every weight file
+    in a model folder; None where there is none.
     """
     files = sorted(Path(folder).glob("*.safetensors"))
     digest, block = hashlib.sha256(), 4096
@@ -74,7 +74,7 @@ def load_causal(folder: str, dtype: torch.dtype = torch.float32) -> Any:
 
 def fused(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
     """A model of `pretrained` or `without_weights`, with fused attention where its architecture has it. What
-    its configuration says of attention is not heard: it may name a kernel to download.
+    its configuration chooses for attention is ignored: it may name a kernel to download.
     """
     try:
         return make(*arguments, **options, attn_implementation="sdpa")
@@ -97,7 +97,7 @@ def without_dropout(model: nn.Module) -> None:
 def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
     """Every token that ends a response: those the model's generation settings name, else the tokenizer's.
 
-    The tokenizer's own stands first: it is the one that training data is closed with.
+    The tokenizer's own comes first: it is the one that training data is closed with.
     """
     for source in (getattr(model, "generation_config", None), model.config, tokenizer):
         found = getattr(source, "eos_token_id", None)
@@ -147,7 +147,7 @@ def without_weights(kind: Any, config: Any, **options: Any) -> Any:
 def refuse_code(folder: str | Path) -> None:
     """ValueError for a model that names code: in ``auto_map``, or by an adapter beside it.
 
-    Of a hub id the adapter alone is looked for; its ``auto_map`` is refused by transformers, where it has no
+    Of a hub id only the adapter is looked for; its ``auto_map`` is refused by transformers, where it has no
     code of its own for the architecture.
     """
     path = Path(folder)
@@ -176,7 +176,7 @@ def refuse_code(folder: str | Path) -> None:
 
 
 def _names_code(value: Any) -> bool:
-    """Whether ``auto_map`` stands anywhere in a configuration: the parts of a composite model have their
+    """Whether ``auto_map`` occurs anywhere in a configuration: the parts of a composite model have their
     own.
     """
     if isinstance(value, dict):
@@ -186,7 +186,7 @@ def _names_code(value: Any) -> bool:
 
 def read_object(path: Path) -> dict[str, Any]:
     """The object in a JSON file as other programs write them: NaN and Infinity are let pass, a key that
-    stands twice is not (which one counts is every reader's own choice). ValueError names the file.
+    occurs twice is not (readers differ in which one counts). ValueError names the file.
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):

@@ -177,7 +177,7 @@ def folded(model: Any, name: str | None) -> Iterator[None]:
 def checkpoint_activations(model: Any) -> None:
     """Compute activations again in the backward pass, with the adapter that was on in the forward pass.
 
-    transformers does so in training mode alone; dropout is 0 everywhere.
+    transformers does so only in training mode; dropout is 0 everywhere.
     """
     enable = getattr(model, "activation_checkpointing_enable", None) or model.gradient_checkpointing_enable
 

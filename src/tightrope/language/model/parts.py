@@ -47,7 +47,7 @@ def parts(model: Any) -> Parts:
                     return Parts(base, layers, head)
     raise ValueError(
         f"{type(model).__name__} is not a decoder-only model whose layers and head can be found. Llama, "
-        "Qwen, Mistral, GPT-2 and their kin are."
+        "Qwen, Mistral, GPT-2 and similar models are."
     )
 
 

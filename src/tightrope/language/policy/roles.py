@@ -148,7 +148,7 @@ def make_roles(
 
 def judges_of(settings: AlignSettings, own_reward: bool) -> list[Path]:
     """The folders of reward models that the settings name and that have a trunk of their own: the reward
-    where ``own_reward`` says so, the gold judge always.
+    with ``own_reward``, the gold judge always.
     """
     named = [settings.reward if own_reward else None, settings.gold]
     return [Path(name) for name in named if name and Path(name).is_dir()]

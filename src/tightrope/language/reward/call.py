@@ -33,12 +33,12 @@ LARGEST = 1e30  # above it a score, or a sum of weighted ones, would be infinite
 
 
 class RewardError(ValueError):
-    """A reward function cannot be used as it is; the message names it, and says what to do."""
+    """A reward function cannot be used as it is; the message names it and what to do."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Why samples are masked: ``function`` did not score ``samples``, ``text`` says how.
+    """Why samples are masked: ``function`` did not score ``samples``, ``text`` is the reason.
 
     ``kind`` "none": every function returned None for them; ``function`` is then empty.
     """

@@ -116,7 +116,7 @@ class Rewards:
     ) -> Scores:
         """Score B responses. ``columns``: the data's other columns, B entries each.
 
-        Functions may change the lists they are given: each has its own. Raises RewardError as the class says,
+        Functions may change the lists they are given: each gets copies. Raises RewardError as above,
         for a function that wants what is not offered, and when three batches in a row have not one valid
         sample: nothing would be learnt. Raises ValueError when lengths differ, or a column has the name of
         an argument.

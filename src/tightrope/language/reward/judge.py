@@ -101,7 +101,7 @@ class Judge:
 def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) -> Scores:
     """The functions' scores and a reward model's, [B], added up.
 
-    Where no function applies the model's stands alone. A score of the model that is not finite masks its
+    Where no function applies only the model's score counts. A score of the model that is not finite masks its
     response. RewardError when none is finite: the model is broken.
     """
     good = np.isfinite(learnt)
@@ -112,9 +112,9 @@ def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) ->
         )
     if found is None:
         found = Scores(np.zeros(len(learnt)), np.ones(len(learnt), bool), {}, {}, {})
-    alone = np.zeros(len(learnt), bool)
-    alone[[sample for fault in found.faults if fault.kind == "none" for sample in fault.samples]] = True
-    valid = (found.valid | alone) & good
+    model_only = np.zeros(len(learnt), bool)
+    model_only[[sample for fault in found.faults if fault.kind == "none" for sample in fault.samples]] = True
+    valid = (found.valid | model_only) & good
     part, name = np.where(good, learnt, np.nan), unique_name(found.parts, "reward_model")
     faults = [fault for fault in found.faults if fault.kind != "none"]
     if not good.all():
@@ -123,7 +123,7 @@ def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) ->
         text = f"The reward model gave {learnt[bad[0]]} for {where}, expected a finite number."
         faults.append(Fault(name, "not finite", bad, text))
     return Scores(
-        total=np.where(valid, np.where(alone, 0.0, found.total) + weight * part, np.nan),
+        total=np.where(valid, np.where(model_only, 0.0, found.total) + weight * part, np.nan),
         valid=valid,
         parts={**found.parts, name: part},
         metrics={**found.metrics, f"scores/{name}": float(part[good].mean())},
