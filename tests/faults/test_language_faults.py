@@ -168,17 +168,19 @@ def test_a_rollout_whose_gradients_do_not_fit_goes_on_without_keeping_them(folde
     from tightrope.language.alignment import experience as collect
     from tightrope.language.policy.policy_model import PolicyModel
 
-    whole, init, results, kept = collect._look, PolicyModel.__init__, [], []
+    whole, init, results, kept = collect._evaluate, PolicyModel.__init__, [], []
 
     def full(*arguments):
         if torch.is_grad_enabled():
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return whole(*arguments)
 
-    counted = lambda *a, said=None, **k: kept.append(said is not None) or init(*a, said=said, **k)  # noqa: E731
+    counted = lambda *a, first_pass=None, **k: (  # noqa: E731
+        kept.append(first_pass is not None) or init(*a, first_pass=first_pass, **k)
+    )
     monkeypatch.setattr(PolicyModel, "__init__", counted)
     for look in (whole, full):
-        monkeypatch.setattr(collect, "_look", look)
+        monkeypatch.setattr(collect, "_evaluate", look)
         made = trainer(folder)
         assert len(list(made.iterate())) == 2
         results.append(trained(made))
@@ -195,7 +197,7 @@ def test_a_pass_that_failed_for_memory_is_held_by_nothing(folder, monkeypatch):
 
     def remembered(*arguments, **how):
         experience = gather(*arguments, **how)
-        graphs.extend(weakref.ref(x) for x in experience.said)
+        graphs.extend(weakref.ref(x) for x in vars(experience.first_pass).values())
         return experience
 
     def full(*arguments):

@@ -11,10 +11,12 @@ import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
 from tightrope.algorithms.optimise import Brake
+from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Pair, preference_pairs
-from tightrope.language.data.padding import pad_left, pad_right
 from tightrope.language.model import lora
-from tightrope.language.model.load import load_causal, parts
+from tightrope.language.model.load import load_causal
+from tightrope.language.model.parts import parts
+from tightrope.language.model.saving import load_adapter
 from tightrope.language.reward.model import SHIFT, RewardModel, last_real, load_reward
 from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised.fit import Objective, take_step
@@ -271,7 +273,7 @@ def test_the_adapter_scores_alike_on_a_trunk_that_is_shared(tmp_path, folder):
     settings = settings_of(folder, tune="lora", lora_layers=2, learning_rate=1e-2)
     train_reward(settings, data=rows, run_dir=tmp_path / "run")
     trunk = load_causal(folder)
-    lora.load_adapter(trunk, "reward", tmp_path / "run" / "adapter")
+    load_adapter(trunk, "reward", tmp_path / "run" / "adapter")
     kept = load_file(tmp_path / "run" / "adapter" / "head.safetensors")
     head = torch.nn.Linear(32, 1, bias=False)
     head.weight.data = kept["score.weight"]

@@ -6,10 +6,9 @@ import pytest
 import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama
 
-from tightrope.language.data.padding import positions
-from tightrope.language.generation.distribution import Sampling
+from tightrope.language.data.batching import positions
+from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import draw, sample
-from tightrope.language.generation.token_stats import token_statistics
 from tightrope.language.model.load import load_causal, without_dropout
 from tightrope.language.model.trunk import Trunk
 

@@ -13,10 +13,11 @@ from language.test_data import chatml, random_examples
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
 from tightrope.algorithms.optimise import Brake, NonFiniteError
-from tightrope.language.data.packing import collate, pack, row_of
-from tightrope.language.data.split import hold_out
+from tightrope.language.data.batching import collate, pack, row_of
+from tightrope.language.data.examples import hold_out
 from tightrope.language.model import lora
-from tightrope.language.model.load import load_causal, load_tokenizer, parts
+from tightrope.language.model.load import load_causal, load_tokenizer
+from tightrope.language.model.parts import parts
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, micro_batches, take_step
 from tightrope.language.supervised.prepare import load

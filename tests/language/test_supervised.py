@@ -11,7 +11,7 @@ from language.test_reward_model import preferences
 from language.tiny import saved, tiny_llama, tokenizer
 
 from tightrope.cli.main import main
-from tightrope.language.memory.ledger import DoesNotFit, amount, job_of, ledger
+from tightrope.language.memory import DoesNotFit, amount, job_of, ledger
 from tightrope.language.settings import RewardSettings, SFTSettings
 from tightrope.language.supervised import fit as fitting
 from tightrope.language.supervised.fit import minibatches

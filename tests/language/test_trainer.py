@@ -108,7 +108,9 @@ def test_the_pass_that_the_rollout_keeps_changes_no_metric(folder, monkeypatch):
     values = {"minibatch_size": 16, "num_epochs": 2, "total_episodes": 48, "critic_warmup": 1}
     taken, found = [], []
     init = PolicyModel.__init__
-    counted = lambda *a, said=None, **k: taken.append(said is not None) or init(*a, said=said, **k)  # noqa: E731
+    counted = lambda *a, first_pass=None, **k: (  # noqa: E731
+        taken.append(first_pass is not None) or init(*a, first_pass=first_pass, **k)
+    )
     monkeypatch.setattr(PolicyModel, "__init__", counted)
     for micro in (None, 16):
         made = shaken(trainer(folder, micro_batch_size=micro, **values))

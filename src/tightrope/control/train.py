@@ -100,7 +100,7 @@ def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy
         if point is not None:
             learner.restore(point)
         continue_from(learner, run, point)
-        if learner.done:
+        if learner.complete:
             told.info(f"{run_dir} has its {learner.total} steps; --total-steps N goes on from there.")
         return loop.train(learner, run, told)
 
@@ -136,7 +136,7 @@ class AgentLearner:
         return self.settings.total_steps
 
     @property
-    def done(self) -> bool:
+    def complete(self) -> bool:
         """Whether the budget is spent: what is left is less than one step in every environment."""
         return self.position + self.settings.num_envs > self.total
 

@@ -12,11 +12,12 @@ import numpy as np
 import torch
 
 from tightrope.language.alignment.samples import read_samples
+from tightrope.language.data.batching import pad_left
 from tightrope.language.data.examples import Prompt, read_prompts
-from tightrope.language.data.padding import pad_left
 from tightrope.language.generation.distribution import Sampling
 from tightrope.language.generation.sample import sample
-from tightrope.language.model.load import eos_ids, find_model, load_causal, load_tokenizer
+from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer
+from tightrope.language.model.packaged import find_model
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.run import Run
@@ -37,14 +38,15 @@ def sample_run(
         raise ValueError(f"seed is {seed}, expected 0 or more.")
     if not (path / "model" / "config.json").is_file():
         raise ValueError(
-            f"{path} holds no aligned model: the run has not come to its end, or is none of align."
+            f"{path} holds no aligned model: the run has not finished, or is not a run of align."
         )
     rows = list(prompt) if prompt else _prompts_of(path, count)
     tokenizer = load_tokenizer(str(path / "model"))
-    longest, number = settings.max_prompt_tokens, settings.seed + 1 if seed is None else seed
-    prompts = read_prompts([{"prompt": row} for row in rows], tokenizer, max_tokens=longest)
+    seed = settings.seed + 1 if seed is None else seed
+    rows = [{"prompt": row} for row in rows]
+    prompts = read_prompts(rows, tokenizer, max_tokens=settings.max_prompt_tokens)
     texts = {
-        name: respond(folder, prompts, settings, number)
+        name: _responses(folder, prompts, settings, seed)
         for name, folder in (("before", find_model(settings.model)), ("after", str(path / "model")))
     }
     return [
@@ -63,7 +65,7 @@ def _prompts_of(path: Path, count: int) -> list[Any]:
     return list(found.values())
 
 
-def respond(folder: str, prompts: Sequence[Prompt], settings: AlignSettings, seed: int) -> list[str]:
+def _responses(folder: str, prompts: Sequence[Prompt], settings: AlignSettings, seed: int) -> list[str]:
     """One response to every prompt, sampled as in training."""
     model, tokenizer = load_causal(folder), load_tokenizer(folder)
     tokens, real = pad_left([prompt.tokens for prompt in prompts])

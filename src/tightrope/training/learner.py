@@ -63,7 +63,7 @@ class Learner(Protocol):
         """Steps of the whole run."""
 
     @property
-    def done(self) -> bool:
+    def complete(self) -> bool:
         """Whether no update is left."""
 
     @property

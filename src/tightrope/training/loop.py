@@ -40,7 +40,7 @@ class _Loop:
                 # before the save, so that a resumed run knows what was changed at its checkpoint
                 if self._requests():
                     break
-                if update.on_grid and not learner.done:  # the end has its own save
+                if update.on_grid and not learner.complete:  # the end has its own save
                     self._save()
             self._evaluated(learner.position, learner.conclude())
             self._save(final=True)

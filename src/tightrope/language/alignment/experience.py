@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,66 +14,49 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.memory import OutOfMemory, free, is_out_of_memory
 from tightrope.language.alignment.kl import kl_rewards
+from tightrope.language.data.batching import length_groups, pad_left
 from tightrope.language.data.examples import Prompt
-from tightrope.language.data.padding import pad_left
-from tightrope.language.generation.completions import Answers
-from tightrope.language.generation.sample import Responses, sample
-from tightrope.language.generation.token_stats import token_statistics
-from tightrope.language.memory.exhausted import advising_on_memory
-from tightrope.language.policy.policy_model import Said, length_groups
+from tightrope.language.generation.distribution import token_statistics
+from tightrope.language.generation.sample import Completions, sample
 from tightrope.language.policy.roles import Roles
+from tightrope.language.policy.rollout import Experience, FirstPass, Inputs
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings
-from tightrope.maths import divergence, returns
-from tightrope.maths.statistics import masked_mean, masked_sum, masked_variance
-
-
-@dataclass
-class Experience(Answers):
-    """Responses and what the roles say of them.
-
-    ``logp``, ``ref_logp``, ``entropy``, ``exact`` (KL of the state), ``values``: [B, R]. ``final_values``
-    [B]: V of the state after the last token. ``lower`` and ``ref_hidden`` are kept for the epochs that
-    follow, ``said`` for the first one: the same numbers with their gradients; ``short_of_memory`` where they
-    did not fit.
-    """
-
-    logp: Tensor
-    ref_logp: Tensor
-    entropy: Tensor
-    exact: Tensor
-    values: Tensor
-    final_values: Tensor
-    ref_hidden: Tensor | None
-    said: Said | None
-    short_of_memory: bool = False
-
-    @property
-    def last(self) -> Tensor:
-        """[B]: the column of each response's last real token."""
-        return self.responses.mask.sum(1) - 1
+from tightrope.maths import returns
+from tightrope.maths.statistics import masked_variance
 
 
 class PromptOrder:
-    """Prompts in a fresh random order for every pass over them: a function of seed and position alone."""
+    """Prompts in a new random order for every pass over them: a function of only seed and position."""
 
     def __init__(self, count: int, seed: int) -> None:
         self.count, self.seed, self.position = count, seed, 0
 
-    def take(self, number: int) -> list[int]:
-        """The indices of the next prompts; ``position`` says how many were taken so far."""
+    def take(self, count: int) -> list[int]:
+        """The indices of the next ``count`` prompts; ``position`` is the number taken so far."""
         taken = []
-        for place in range(self.position, self.position + number):
-            order = np.random.default_rng([self.seed, 7, place // self.count]).permutation(self.count)
-            taken.append(int(order[place % self.count]))
-        self.position += number
+        for index in range(self.position, self.position + count):
+            order = np.random.default_rng([self.seed, 7, index // self.count]).permutation(self.count)
+            taken.append(int(order[index % self.count]))
+        self.position += count
         return taken
 
 
-@advising_on_memory
-def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Answers:
-    """``samples`` responses of the policy to each prompt; rows of one prompt are neighbours."""
+def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Completions:
+    """``samples`` responses of the policy to each prompt; rows of one prompt are neighbours.
+
+    Raises OutOfMemory, with advice.
+    """
+    try:
+        return _respond(roles, prompts, seed, iteration, samples)
+    except (RuntimeError, MemoryError) as error:
+        _advise_on_memory(roles, error)
+        raise
+
+
+def _respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Completions:
     settings, begin = roles.settings, time.perf_counter()
     device = next(roles.model.parameters()).device
     tokens, real = (x.to(device) for x in pad_left([prompt.tokens for prompt in prompts]))
@@ -84,70 +68,101 @@ def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, 
         )
     tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
     real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
-    return Answers(tokens, real, responses, time.perf_counter() - begin, lower=None)
+    return Completions(tokens, real, responses, time.perf_counter() - begin, lower=None)
 
 
-@advising_on_memory
 def gather(
     roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int, *, keep: bool = False
 ) -> Experience:
-    """``samples`` responses to each prompt, and what policy, reference and critic say of them.
+    """``samples`` responses to each prompt, and what policy, reference and critic compute for them.
 
-    No gradients; with ``keep``, and where responses of about one length need no groups, what is said keeps
-    its own for an update whose first pass is over all rows: that would say the same again. OutOfMemory, with
-    advice, when memory runs out without ``keep`` as well.
+    Without gradients. With ``keep`` the pass keeps its graph, so that the first epoch can reuse it: where the
+    responses are of about one length, need no groups, and memory is enough. Raises OutOfMemory, with advice,
+    when memory runs out without ``keep`` as well.
     """
-    settings, answers = roles.settings, respond(roles, prompts, seed, iteration, samples)
-    tokens, real, responses = answers.tokens, answers.real, answers.responses
-    rows = len(tokens)
-    keep = keep and len(length_groups(real, responses.mask)) == 1
+    answers = respond(roles, prompts, seed, iteration, samples)
+    if keep and len(length_groups(answers.real, answers.responses.mask)) == 1:
+        try:
+            return _evaluated(roles, answers, keep=True)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+        # outside the except clause, which keeps the failed pass's tensors alive
+        free()
+        return dataclasses.replace(_evaluated(roles, answers), short_of_memory=True)
+    try:
+        return _evaluated(roles, answers)
+    except (RuntimeError, MemoryError) as error:
+        _advise_on_memory(roles, error)
+        raise
+
+
+def _advise_on_memory(roles: Roles, error: RuntimeError | MemoryError) -> None:
+    """OutOfMemory, which names the settings to lower, for an error that is one of memory."""
+    if isinstance(error, OutOfMemory) or not is_out_of_memory(error):
+        return
+    reason = (str(error).splitlines() or [""])[0][:200]
+    raise OutOfMemory(
+        f"Memory is not enough to sample {roles.settings.batch_size} responses at once ({reason}). Choose a "
+        "smaller --batch-size, --max-new-tokens or --max-prompt-tokens; --micro-batch-size makes the pass "
+        "over the finished responses smaller."
+    ) from error
+
+
+def _evaluated(roles: Roles, answers: Completions, *, keep: bool = False) -> Experience:
+    settings, rows = roles.settings, len(answers.tokens)
     size = rows if keep else settings.update.micro_batch_size or rows
     # a folded weight rounds otherwise than weight and adapter apart, which is what trains: in float32 within
     # the tolerance, in bfloat16 far beyond it
     folded = settings.dtype == "float32" and not keep
     with roles.frozen_policy() if folded else contextlib.nullcontext(), torch.set_grad_enabled(keep):
-        pieces = [_look(roles, tokens, real, responses, slice(k, k + size)) for k in range(0, rows, size)]
-    said = tuple(pieces[0][name] for name in ("logp", "entropy", "exact", "values")) if keep else None
-    pieces = [{name: None if x is None else x.detach() for name, x in piece.items()} for piece in pieces]
-    joined = {name: _joined([piece[name] for piece in pieces]) for name in pieces[0]}
-    return Experience(tokens, real, responses, answers.seconds, said=said, **joined)
+        pieces = [_evaluate(roles, answers, slice(k, k + size)) for k in range(0, rows, size)]
+    first_pass = None
+    if keep:
+        (found,) = pieces
+        first_pass = FirstPass(found["logp"], found["entropy"], found["values"], found["exact"])
+    joined: dict[str, Any] = {
+        name: None if first is None else torch.cat([piece[name] for piece in pieces]).detach()
+        for name, first in pieces[0].items()
+    }
+    return Experience(
+        answers.tokens, answers.real, answers.responses, answers.seconds, first_pass=first_pass, **joined
+    )
 
 
-def _joined(parts: list[Any]) -> Any:
-    return None if parts[0] is None else torch.cat(parts)
-
-
-def _look(roles: Roles, tokens: Tensor, real: Tensor, responses: Responses, rows: slice) -> dict[str, Any]:
-    """What the roles say of some rows."""
-    tokens, real, mask = tokens[rows], real[rows], responses.mask[rows]
+def _evaluate(roles: Roles, answers: Completions, rows: slice) -> dict[str, Any]:
+    """What the roles compute for some rows, by the names of `Experience`'s fields."""
+    tokens, real, responses = answers.tokens[rows], answers.real[rows], answers.responses
+    mask = responses.mask[rows]
     first = tokens.shape[1] - mask.shape[1] - 1
     lower = roles.trunk.lower(tokens, real)
-    policy = roles.policy_hidden(tokens, real, lower)
-    reference = roles.reference_hidden(tokens, real, lower)[:, first:-1]
+    policy = roles.policy.hidden(tokens, real, lower)
+    with torch.no_grad():
+        reference = roles.reference.hidden(tokens, real, lower)[:, first:-1]
     support = None if responses.support is None else responses.support[rows][mask]
-    own = token_statistics(
+    found = token_statistics(
         policy[:, first:-1][mask], roles.trunk.parts.head, responses.tokens[rows][mask], roles.sampling,
-        support=support, reference=reference[mask], reference_head=roles.head_of_reference(),
+        support=support, reference=reference[mask], reference_head=roles.reference.trunk.parts.head,
         ahead=roles.settings.logp_alone,
     )  # fmt: skip
     zeros = torch.zeros(mask.shape, device=tokens.device)
     values, final = zeros, zeros[:, 0]
     if roles.critic_head is not None:
-        hidden = roles.critic_hidden(policy, tokens, real, lower)[:, first:]
-        every = roles.critic_head(hidden.float())[:, :, 0]
+        hidden = policy if roles.critic is None else roles.critic.hidden(tokens, real, lower)
+        every = roles.critic_head(hidden[:, first:].float())[:, :, 0]
         values = torch.where(mask, every[:, :-1], 0.0)
         final = every.gather(1, mask.sum(1, keepdim=True))[:, 0]
-    found = {
-        name: zeros.masked_scatter(mask, x)
-        for name, x in (
-            ("logp", own.logp),
-            ("entropy", own.entropy),
-            ("exact", own.kl),
-            ("ref_logp", own.reference_logp),
-        )
-    }
     kept = torch.where(mask[..., None], reference, 0.0) if roles.settings.exact_in_loss else None
-    return {**found, "values": values, "final_values": final, "lower": lower, "ref_hidden": kept}
+    return {
+        "logp": zeros.masked_scatter(mask, found.logp),
+        "entropy": zeros.masked_scatter(mask, found.entropy),
+        "exact": zeros.masked_scatter(mask, found.kl),
+        "ref_logp": zeros.masked_scatter(mask, found.reference_logp),
+        "values": values,
+        "final_values": final,
+        "lower": lower,
+        "ref_hidden": kept,
+    }
 
 
 def kl_share(experience: Experience, settings: AlignSettings, kl_beta: float) -> Tensor:
@@ -157,8 +172,15 @@ def kl_share(experience: Experience, settings: AlignSettings, kl_beta: float) ->
     step they are equal to the bit, where those of sampling differ by rounding, which normalised advantages
     would blow up to full strength.
     """
-    steps = (experience.ref_logp, experience.exact, experience.responses.mask, settings.update.gamma)
-    return kl_rewards(settings.kl, kl_beta, experience.logp, *steps)
+    return kl_rewards(
+        settings.kl,
+        kl_beta,
+        logp=experience.logp,
+        ref_logp=experience.ref_logp,
+        exact=experience.exact,
+        mask=experience.responses.mask,
+        gamma=settings.update.gamma,
+    )
 
 
 def rewards_of(
@@ -187,12 +209,13 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
     """Advantages and returns of the responses whose score counts (``valid`` [B]), as ppo.update takes
     them.
     """
-    mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
+    mask, last = experience.responses.mask, experience.last
+    rows = torch.arange(len(mask))
     ended = torch.zeros_like(mask)
-    ended[rows, experience.last] = True
+    ended[rows, last] = True
     terminated = ended.clone()
     if settings.truncation == "bootstrap":
-        terminated[rows, experience.last] = experience.responses.ended
+        terminated[rows, last] = experience.responses.ended
     update, values = settings.update, experience.values
     if settings.critic == "none":
         advantages = leave_one_out(rewards, mask, valid, settings.samples_per_prompt, settings.update.gamma)
@@ -204,18 +227,30 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
         if settings.lambda_alpha is not None:
             policy_lambda = length_lambda(mask.sum(1), settings.lambda_alpha)
         critic_lambda = update.gae_lambda if settings.critic_lambda is None else settings.critic_lambda
-        steps = (rewards, values, following, terminated, ended, update.gamma)
-        advantages = returns.gae(*steps, policy_lambda, mask)
-        targets = returns.gae(*steps, critic_lambda, mask) + values
+        estimate = functools.partial(
+            returns.gae,
+            rewards=rewards,
+            values=values,
+            next_values=following,
+            terminated=terminated,
+            ended=ended,
+            gamma=update.gamma,
+            mask=mask,
+        )
+        advantages = estimate(gae_lambda=policy_lambda)
+        one_lambda = settings.lambda_alpha is None and critic_lambda == policy_lambda
+        targets = (advantages if one_lambda else estimate(gae_lambda=critic_lambda)) + values
     old = experience.responses.logp if settings.dtype == "float32" else experience.logp
-    inputs = {"tokens": experience.tokens, "real": experience.real, "ref_logp": experience.ref_logp}
-    inputs["row"] = torch.arange(len(mask), device=mask.device)
-    optional = {
-        "lower": experience.lower, "ref_hidden": experience.ref_hidden,
-        "support": experience.responses.support,
-    }  # fmt: skip
-    inputs |= {name: x for name, x in optional.items() if x is not None}
-    batch = Batch(inputs, experience.responses.tokens, old, values, advantages, targets, mask)
+    inputs = Inputs(
+        tokens=experience.tokens,
+        real=experience.real,
+        ref_logp=experience.ref_logp,
+        row=torch.arange(len(mask), device=mask.device),
+        lower=experience.lower,
+        ref_hidden=experience.ref_hidden,
+        support=experience.responses.support,
+    )
+    batch = Batch(inputs.as_dict(), experience.responses.tokens, old, values, advantages, targets, mask)
     return batch.select(valid.nonzero()[:, 0])
 
 
@@ -244,56 +279,3 @@ def leave_one_out(rewards: Tensor, mask: Tensor, valid: Tensor, samples: int, ga
     count = valid.view(-1, samples).to(total)
     others = (total.sum(1, keepdim=True) - total) / (count.sum(1, keepdim=True) - count).clamp(min=1)
     return torch.where(mask, to_go - others.view(-1, 1), 0.0)
-
-
-def describe(
-    experience: Experience, scores: Scores, rewards: Tensor, kl_share: Tensor, valid: Tensor
-) -> dict[str, float]:
-    """The metrics of a rollout: sums over a response, and token means under names that say so. ``rewards``
-    and the share of the KL in them, before any scaling, are [B, R].
-
-    Scores and rewards are those of the responses that count, everything else is of all of them; NaN for a
-    score where none counts.
-    """
-    mask = experience.responses.mask
-    count = len(mask)
-    log_ratio = torch.where(mask, experience.ref_logp - experience.logp, 0.0)
-
-    def per_response(x: Tensor) -> float:
-        return float(masked_sum(x, mask)) / count
-
-    total, ended = scores.total[scores.valid], experience.responses.ended
-    score = float(np.mean(total)) if len(total) else float("nan")
-
-    def of_valid(x: Tensor) -> float:
-        return float(masked_sum(x, mask & valid[:, None])) / len(total) if len(total) else float("nan")
-
-    gap = (experience.responses.logp - experience.logp)[mask].abs()
-    return {
-        "objective/kl": per_response(divergence.k1(log_ratio)),
-        "objective/kl_k2": per_response(divergence.k2(log_ratio)),
-        "objective/kl_k3": per_response(divergence.k3(log_ratio)),
-        "objective/kl_exact": per_response(experience.exact),
-        "objective/kl_token_mean": float(masked_mean(divergence.k1(log_ratio), mask)),
-        "objective/scores": score,
-        "objective/scores_std": float(np.std(total)) if len(total) else float("nan"),
-        "objective/rlhf_reward": of_valid(rewards),
-        "objective/non_score_reward": of_valid(kl_share),
-        "objective/entropy": per_response(-experience.logp),
-        "objective/entropy_exact": per_response(experience.entropy),
-        "objective/entropy_token_mean": float(masked_mean(-experience.logp, mask)),
-        "objective/response_length": float(mask.sum()) / count,
-        "objective/eos_fraction": float(ended.float().mean()),
-        "objective/truncated_fraction": float((~ended).float().mean()),
-        "objective/masked_samples": float((~valid).sum()),
-        "objective/distinct_2": distinct(experience.ids()),
-        "objective/sampling_gap": float(gap.max()) if gap.numel() else 0.0,
-        "time/generate_seconds": experience.seconds,
-        "time/tokens_per_second": float(experience.responses.mask.sum()) / max(experience.seconds, 1e-9),
-    }
-
-
-def distinct(rows: list[list[int]], n: int = 2) -> float:
-    """Distinct n-grams / all n-grams over a batch: falls towards 0 when responses repeat themselves."""
-    grams = [tuple(row[k : k + n]) for row in rows for k in range(len(row) - n + 1)]
-    return len(set(grams)) / len(grams) if grams else 1.0

@@ -16,31 +16,30 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms import ppo
-from tightrope.algorithms.batch import Batch, Evaluation
+from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
-from tightrope.language.alignment.checks import refuse_bad_numbers, refuse_mismatch
 from tightrope.language.alignment.experience import (
-    Experience,
     PromptOrder,
     comparable,
-    describe,
     gather,
     kl_share,
     respond,
     rewards_of,
     to_batch,
 )
+from tightrope.language.alignment.figures import describe, refuse_bad_numbers, refuse_mismatch
 from tightrope.language.alignment.kl import AdaptiveKL, kl_loss, shared_scale
 from tightrope.language.alignment.monitor import Monitor
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.alignment.samples import sample_rows
-from tightrope.language.data.examples import Prompt, hold_out, read_prompts, read_rows
+from tightrope.language.data.examples import Prompt, hold_out_prompts, read_prompts, read_rows
 from tightrope.language.generation.sample import log_ratio_limit
-from tightrope.language.model import lora
-from tightrope.language.model.load import context_length, find_model
-from tightrope.language.model.saving import write_model
+from tightrope.language.model.packaged import find_model
+from tightrope.language.model.parts import context_length
+from tightrope.language.model.saving import save_adapter, write_model
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
+from tightrope.language.policy.rollout import Experience, FirstPass
 from tightrope.language.reward.call import RewardError
 from tightrope.language.reward.judge import (
     Judge,
@@ -84,7 +83,7 @@ class Trainer:
         self.gold: Judge | None = None
         if gold is not None:
             self.gold = make_judge(gold, self.roles, on_trunk=None, timeout=settings.reward_timeout)
-            self.prompts, self.held_out = hold_out(self.prompts, settings.held_out_prompts)
+            self.prompts, self.held_out = hold_out_prompts(self.prompts, settings.held_out_prompts)
         if settings.critic_from_reward:
             critic_from_reward(self.judge, self.roles, reward)
         self.optimiser = make_optimiser(
@@ -129,7 +128,7 @@ class Trainer:
         return self.settings.total_episodes
 
     @property
-    def done(self) -> bool:
+    def complete(self) -> bool:
         """Whether the budget is spent, of responses or of KL."""
         return not self._next_prompts()
 
@@ -296,7 +295,7 @@ class Trainer:
         experience = gather(self.roles, prompts, *given, keep=keep)
         if experience.short_of_memory:
             self._smaller(len(experience.tokens))
-        refuse_bad_numbers(experience, self.roles)
+        refuse_bad_numbers(experience, self.roles.named_parameters())
         gathered = time.perf_counter()
         asked = [prompt for prompt in prompts for _ in range(settings.samples_per_prompt)]
         scores = self.judge(asked, experience, self._trainer_state())
@@ -338,8 +337,9 @@ class Trainer:
         """PPO, or the critic alone while it warms up."""
         warming = self.iteration < self.settings.critic_warmup
         exact = self.settings.exact_in_loss
-        model = PolicyModel(self.roles, exact=exact, critic_alone=warming, said=experience.said)
-        experience.said = None  # where memory runs out, nothing may hold on to a pass that is begun anew
+        model = PolicyModel(
+            self.roles, exact=exact, critic_only=warming, first_pass=experience.take_first_pass()
+        )
         if warming:
             batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
             present = present.unchecked(entropy_weight=0.0, target_kl=None)
@@ -371,10 +371,10 @@ class Trainer:
         """The KL's share in the loss and the pretraining loss; None when neither is asked for."""
         form, pretraining = self.settings.kl, self.pretraining
 
-        def extra(model: Any, part: Batch, now: Evaluation, count: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        def extra(model: Any, part: Batch, now: FirstPass, count: Tensor) -> tuple[Tensor, dict[str, Any]]:
             total, booked = now.logp.new_zeros(()), dict[str, Any]()
             log_ratio = now.logp.detach() - part.old_logp
-            kl = kl_loss(form, now.logp, part.inputs["ref_logp"], model.kl, part.mask, count, log_ratio)
+            kl = kl_loss(form, now.logp, part.inputs["ref_logp"], now.kl, part.mask, count, log_ratio)
             if kl is not None:
                 total = total + kl_weight * kl
                 booked["kl_loss"] = kl.detach() * count / part.mask.sum().clamp(min=1) * part.mask
@@ -431,4 +431,4 @@ def save_model(roles: Roles, path: Path, settings: AlignSettings) -> None:
     write_model(roles.model, roles.tokenizer, path / "model", name)
     if name is not None:
         with whole(path / "adapter") as folder:
-            lora.save_adapter(roles.model, name, folder, base_model=find_model(settings.model))
+            save_adapter(roles.model, name, folder, base_model=find_model(settings.model))

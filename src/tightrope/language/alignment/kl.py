@@ -139,7 +139,7 @@ def kl_steps(
     0 where masked. ``logp`` and ``exact`` are of the policy as it is now, with their graphs. ``log_ratio``
     [B, R] = log pi / pi_old, no gradient flows through it: k-forms are weighted with pi / pi_old, which keeps
     their expected gradient right when the policy has moved since it sampled. None: no weights, as is right in
-    the first step alone. The exact forms need none. ValueError when shapes differ or ``exact`` is missing.
+    the first step only. The exact forms need none. ValueError when shapes differ or ``exact`` is missing.
     """
     name, _, place = form.partition("-")
     exact = _checked(form, logp, ref_logp, exact, mask)

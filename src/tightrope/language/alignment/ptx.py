@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms.batch import Batch
-from tightrope.language.data.examples import Example, Notify, read_rows, sft_examples
-from tightrope.language.data.padding import pad_right
-from tightrope.language.generation.distribution import Sampling
-from tightrope.language.generation.token_stats import token_statistics
+from tightrope.language.data.batching import Example, pad_right
+from tightrope.language.data.examples import Notify, read_rows, sft_examples
+from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.policy.roles import Roles
 from tightrope.language.settings import AlignSettings
 
@@ -59,7 +58,7 @@ class Pretraining:
             learn[row, : len(example.learn)] = torch.tensor(example.learn, device=device)
         with torch.no_grad():
             lower = self.roles.trunk.lower(tokens, real)
-        hidden = self.roles.policy_hidden(tokens, real, lower)
+        hidden = self.roles.policy.hidden(tokens, real, lower)
         targets = learn[:, 1:]
         found = token_statistics(
             hidden[:, :-1][targets], self.roles.trunk.parts.head, tokens[:, 1:][targets], Sampling()

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from tightrope.algorithms.batch import Batch
-    from tightrope.language.alignment.experience import Experience
     from tightrope.language.data.examples import Prompt
+    from tightrope.language.policy.rollout import Experience
     from tightrope.language.reward.functions import Scores
 
 LONGEST = 300  # characters of a prompt or response in a table

@@ -1,5 +1,5 @@
-"""Training data for language models: rows in, tokens and masks out. What counts is said by a mask, never by a
-token id.
+"""Training data for language models: rows in, tokens and masks out. A mask decides what counts,
+never a token id.
 
 Formats are TRL's: ``text``; ``prompt`` and ``completion``; ``messages``; ``prompt``, ``chosen`` and
 ``rejected``. Padding may be any id: no result depends on it.
@@ -10,30 +10,24 @@ from __future__ import annotations
 import csv
 import json
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from tightrope.language.data import formats
+from tightrope.language.data.batching import Example
 from tightrope.language.data.formats import Encoder, Messages
 
 Row = dict[str, Any] | str
+Item = TypeVar("Item")
 Notify = Callable[[str], None]
 FILES = (".jsonl", ".json", ".csv", ".txt")
-
-
-@dataclass(frozen=True)
-class Example:
-    """One text to learn from: ``learn[i]`` tells whether token i is a target of the loss.
-
-    The first token never is: nothing stands before it that could predict it.
-    """
-
-    tokens: tuple[int, ...]
-    learn: tuple[bool, ...]
 
 
 @dataclass(frozen=True)
@@ -182,7 +176,7 @@ def sft_examples(
     """Examples for supervised fine-tuning.
 
     ``{"text"}`` or a plain string: every token is learnt.  ``{"prompt", "completion"}``, strings or lists of
-    messages, and ``{"messages"}``: completions and assistant turns alone, or everything with
+    messages, and ``{"messages"}``: only completions and assistant turns, or everything with
     ``on_completions`` off. The EOS that closes a text or a reply is learnt, whatever PAD may be; where none
     is written, the first of ``eos`` is appended. Rows over ``max_tokens`` are cut at the end, rows with
     nothing left to learn are left out, and ``notify`` is told how many. ValueError names the row that is
@@ -285,7 +279,7 @@ def _tell(notify: Notify, rows: int, kept: int, cut: int, max_tokens: int, why: 
         notify("; ".join(parts) + "." + (" Raise max_tokens to keep them whole." if cut else ""))
 
 
-def hold_out(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prompt]]:
+def hold_out_prompts(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prompt]]:
     """Prompts to train on and ``count`` (a quarter at most) that never are, not even as equals of themselves.
 
     ValueError when there are too few different ones.
@@ -299,3 +293,31 @@ def hold_out(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prom
         )
     kept = {prompt.tokens for prompt in held}
     return [prompt for prompt in prompts if prompt.tokens not in kept], held
+
+
+def hold_out(
+    items: Sequence[Item], share: float, seed: int, group: Callable[[Item], Hashable] | None = None
+) -> tuple[list[Item], list[Item]]:
+    """Items to train on and items held out, about ``share`` of them, drawn by the seed; in their order.
+
+    Items of one ``group`` stay together, unless a group is larger than the share; equal items always do,
+    where not all are equal. At least one item is held out where there are two or more and the share is above
+    0.
+    """
+    left = max(1, round(share * len(items))) if share > 0 and len(items) > 1 else 0
+    keys: list[Hashable] = list(items) if len(set(items)) > 1 else list(range(len(items)))
+    if group is not None:
+        groups: list[Hashable] = [group(item) for item in items]
+        keys = groups if max(Counter(groups).values(), default=0) <= left else keys
+    sizes = Counter(keys)
+    names = list(sizes)
+    held: set[Hashable] = set()
+    for index in np.random.default_rng([seed, 1]).permutation(len(names)):
+        if left <= 0:
+            break
+        held.add(names[index])
+        left -= sizes[names[index]]
+    parts: tuple[list[Item], list[Item]] = ([], [])
+    for item, key in zip(items, keys, strict=True):
+        parts[key in held].append(item)
+    return parts

@@ -19,7 +19,7 @@ class Encoder:
     def __init__(self, tokenizer: Any, eos: int | Sequence[int] = ()) -> None:
         self.tokenizer = tokenizer
         self.eos = (eos,) if isinstance(eos, int) else tuple(eos)
-        # A probe tells the opening (a BOS, or nothing) from a closing EOS, also where both are one id.
+        # A probe separates the opening (a BOS, or nothing) from a closing EOS, also where both are one id.
         bare, whole = self.bare("a"), list(tokenizer("a")["input_ids"])
         starts = (i for i in range(len(whole)) if bare and whole[i : i + len(bare)] == bare)
         self.opening = whole[: next(starts, 0)]
@@ -44,7 +44,7 @@ class Encoder:
     def closing(self, tokens: list[int]) -> int | None:
         """How many tokens there are up to the EOS that closes a reply, it included; None without such an EOS.
 
-        Behind it may stand blanks alone: chat templates write a newline there, which is never sampled.
+        Only blanks may follow it: chat templates write a newline there, which is never sampled.
         """
         last = max((i for i, token in enumerate(tokens) if token in self.eos), default=None)
         if last is None or self.tokenizer.decode(tokens[last + 1 :]).strip():
@@ -207,8 +207,8 @@ def content(row: dict[str, Any], column: str, place: str) -> str | Messages:
                 f"{column} of {place} holds {message!r}; expected messages like "
                 '{"role": "user", "content": "Hello"}.'
             )
-        said, role = message.get("content"), message["role"]
-        blank = not said or (isinstance(said, str) and not said.strip())
+        text, role = message.get("content"), message["role"]
+        blank = not text or (isinstance(text, str) and not text.strip())
         if blank and role != "system" and not message.get("tool_calls"):
             raise ValueError(
                 f"{column} of {place} has an empty {role} message. Take the row out, or fill it in."

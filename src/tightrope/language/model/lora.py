@@ -10,18 +10,14 @@ off, and a backward pass that comes later drops their gradients without a word).
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.load import parts
-from tightrope.language.model.reading import read_object, read_tensors
-from tightrope.runs.durable import writing
+from tightrope.language.model.parts import parts
 
 
 class Switch:
@@ -181,7 +177,7 @@ def folded(model: Any, name: str | None) -> Iterator[None]:
 def checkpoint_activations(model: Any) -> None:
     """Compute activations again in the backward pass, with the adapter that was on in the forward pass.
 
-    transformers does so in training mode alone; dropout is 0 everywhere.
+    transformers does so only in training mode; dropout is 0 everywhere.
     """
     enable = getattr(model, "activation_checkpointing_enable", None) or model.gradient_checkpointing_enable
 
@@ -236,50 +232,3 @@ def merged_state(model: nn.Module, name: str | None) -> dict[str, Tensor]:
         plain = key.replace(".base.", ".")
         state[plain] = folded.get(plain, tensor).detach()
     return state
-
-
-def save_adapter(
-    model: Any, name: str, folder: Path, *, base_model: str, task_type: str = "CAUSAL_LM"
-) -> None:
-    """Write an adapter as PEFT reads it: adapter_config.json and adapter_model.safetensors."""
-    from safetensors.torch import save_file
-
-    folder.mkdir(parents=True, exist_ok=True)
-    modules = [(p, m) for p, m in model.named_modules() if isinstance(m, Adapted) and name in m.down]
-    rank = modules[0][1].down[name].shape[0]
-    numbers = {int(word) for path, _ in modules for word in path.split(".") if word.isdigit()}
-    config = {
-        "peft_type": "LORA",
-        "task_type": task_type,
-        "base_model_name_or_path": base_model,
-        "r": rank,
-        "lora_alpha": modules[0][1]._scale[name] * rank,
-        "lora_dropout": 0.0,
-        "bias": "none",
-        "fan_in_fan_out": modules[0][1].transposed,
-        "target_modules": sorted({path.rsplit(".", 1)[-1] for path, _ in modules}),
-        "layers_to_transform": sorted(numbers),
-        "inference_mode": True,
-    }
-    state = {key: tensor.cpu().contiguous().clone() for key, tensor in adapter_state(model, name).items()}
-    with writing(folder):
-        save_file(state, folder / "adapter_model.safetensors", metadata={"format": "pt"})
-        (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-
-
-def load_adapter(model: Any, name: str, folder: Path) -> None:
-    """Add an adapter that `save_adapter` (or PEFT) wrote. ValueError when it does not fit the model."""
-    config = read_object(folder / "adapter_config.json")
-    rank, alpha, chosen = config.get("r"), config.get("lora_alpha"), config.get("layers_to_transform")
-    state = read_tensors(folder / "adapter_model.safetensors")
-    ranks, count = {len(x) for key, x in state.items() if ".lora_A." in key}, len(parts(model).layers)
-    layers = chosen if isinstance(chosen, list) and chosen else list(range(count))
-    inside = all(isinstance(layer, int) and 0 <= layer < count for layer in layers)
-    if not (isinstance(rank, int) and {rank} == ranks and isinstance(alpha, int | float) and inside):
-        raise ValueError(
-            f"{folder / 'adapter_config.json'} has r {rank!r}, lora_alpha {alpha!r}, layers_to_transform "
-            f"{chosen!r}; expected the rank {sorted(ranks)} of its weights, a number, and some of the "
-            f"model's {count} layers. Was it made for another model?"
-        )
-    add_adapter(model, name, rank, float(alpha), tuple(layers))
-    load_adapter_state(model, name, state)

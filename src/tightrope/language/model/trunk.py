@@ -9,14 +9,15 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.data.padding import positions
+from tightrope.language.data.batching import positions
 from tightrope.language.model import lora
-from tightrope.language.model.load import WINDOWS, parts
+from tightrope.language.model.parts import WINDOWS, parts
 
 FINAL_NORMS = ("norm", "ln_f", "final_layer_norm")
 NARROW = 3  # tokens of a window while the halves are tried
@@ -48,11 +49,11 @@ class Trunk:
             return _run(self._lower, real, input_ids=tokens)
 
     def hidden(self, tokens: Tensor, real: Tensor, lower: Tensor | None = None) -> Tensor:
-        """Hidden states [B, T, d] after the final norm; ``lower`` saves the lower part."""
+        """Hidden states [B, T, d] after the final norm; ``lower`` saves the lower part of a trunk in two."""
         if self._checkpointing and torch.is_grad_enabled():
-            self.model.train()  # transformers checkpoints in this mode alone, and caches in the other
+            self.model.train()  # transformers checkpoints only in this mode, and caches only in the other
         try:
-            if lower is None:
+            if lower is None or not self.cut:
                 return _run(self.parts.base, real, input_ids=tokens)
             return _run(self._upper, real, inputs_embeds=lower)
         finally:
@@ -79,6 +80,25 @@ class Trunk:
             return False  # an architecture whose layers need more than the layer before them gives
         gap = (whole - both)[real].abs().max() / whole[real].abs().max()
         return bool(gap <= (TOLERANCE if whole.dtype == torch.float32 else 0.05))
+
+
+@dataclass(frozen=True)
+class Role:
+    """One role's forward pass: a trunk, and the adapter that is on in it (None: the bare trunk)."""
+
+    trunk: Trunk
+    adapter: str | None = None
+
+    def hidden(self, tokens: Tensor, real: Tensor, lower: Tensor | None = None) -> Tensor:
+        """Hidden states [B, T, d] of this role; ``lower``: those of the shared lower layers, if known."""
+        switch = getattr(self.trunk.model, "adapter_switch", None)
+        if switch is None:
+            return self.trunk.hidden(tokens, real, lower)
+        before, switch.active = switch.active, self.adapter
+        try:
+            return self.trunk.hidden(tokens, real, lower)
+        finally:
+            switch.active = before
 
 
 def _run(base: nn.Module, real: Tensor, **inputs: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The policy and its critic as ppo.update sees them: a batch of responses -> what is said of every token."""
+"""The policy and its critic as ppo.update sees them: a batch of responses -> figures of every token."""
 
 from __future__ import annotations
 
@@ -7,112 +7,81 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from tightrope.algorithms.batch import Batch, Evaluation
-from tightrope.language.generation.token_stats import token_statistics
+from tightrope.algorithms.batch import Batch
+from tightrope.language.data.batching import length_groups, used_columns
+from tightrope.language.generation.distribution import token_statistics
 from tightrope.language.policy.roles import Roles
-
-MOST_GROUPS, PASS = 4, 64
-Said = tuple[
-    Tensor, Tensor, Tensor, Tensor
-]  # of all rows [B, R]: log p, entropy, KL to the reference, values
+from tightrope.language.policy.rollout import FirstPass, Inputs
 
 
 class PolicyModel:
-    """What ppo.update trains: Batch -> Evaluation, each [B, R]; padding is cut off before the forward pass.
+    """What ppo.update trains: Batch -> FirstPass, each [B, R]; padding is cut off before the forward pass.
 
-    ``exact``: also the exact KL to the reference of every state, left in ``kl`` for the loss ([B, R]).
-    ``said``: what the rollout's own pass says, with its gradients; taken once, for the first question.
+    ``exact``: also the exact KL to the reference of every state. ``critic_only``: no gradient reaches the
+    policy. ``first_pass``: the rollout's own pass with its graph, used for the first call instead of a
+    forward pass.
     """
 
     def __init__(
-        self, roles: Roles, *, exact: bool = False, critic_alone: bool = False, said: Said | None = None
+        self,
+        roles: Roles,
+        *,
+        exact: bool = False,
+        critic_only: bool = False,
+        first_pass: FirstPass | None = None,
     ) -> None:
-        self.roles, self.exact, self.critic_alone, self.said = roles, exact, critic_alone, said
-        self.kl: Tensor | None = None
+        self.roles, self.exact, self.critic_only, self.first_pass = roles, exact, critic_only, first_pass
 
-    def __call__(self, part: Batch) -> Evaluation:
-        """Log-probabilities and entropies of the policy, and the critic's values, where the mask is True."""
-        said, self.said, self.kl = self.said, None, None  # memory ran out: nothing of the pass before is kept
-        if said is not None:
-            logp, entropy, self.kl, values = (x[part.inputs["row"]] for x in said)
-            return Evaluation(logp, entropy, values)
+    def __call__(self, part: Batch) -> FirstPass:
+        """Log-probabilities, entropies and KL of the policy, and the critic's values, where the mask is
+        True.
+        """
+        known, self.first_pass = self.first_pass, None  # a second call after memory ran out must not reuse it
+        if known is not None:
+            return FirstPass(**{name: x[part.inputs["row"]] for name, x in vars(known).items()})
         groups = length_groups(part.inputs["real"], part.mask)
         if len(groups) == 1:
-            logp, entropy, self.kl, values = self._rows(part)
-            return Evaluation(logp, entropy, values)
+            return self._pass(part)
         back = torch.cat(groups).argsort()
-        found = zip(*(self._rows(part.select(rows)) for rows in groups), strict=True)
-        logp, entropy, self.kl, values = (torch.cat(pieces)[back] for pieces in found)
-        return Evaluation(logp, entropy, values)
+        passes = [self._pass(part.select(rows)) for rows in groups]
+        names = ("logp", "entropy", "kl", "values")
+        return FirstPass(**{name: torch.cat([getattr(x, name) for x in passes])[back] for name in names})
 
     def named_parameters(self) -> Iterator[tuple[str, Tensor]]:
         """Everything that may be trained, by name: for messages."""
         return self.roles.named_parameters()
 
-    def _rows(self, part: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Log-probabilities, entropies, KL to the reference and values of some rows, each [b, R]."""
-        roles, mask = self.roles, part.mask
-        columns, length = mask.shape[1], part.inputs["tokens"].shape[1]
-        left, right = trimmed(part.inputs["real"], mask)
-        tokens, real = (part.inputs[name][:, left:right] for name in ("tokens", "real"))
-        lower = part.inputs["lower"][:, left:right] if "lower" in part.inputs else None
+    def _pass(self, part: Batch) -> FirstPass:
+        """One forward pass over some rows."""
+        roles, mask, inputs = self.roles, part.mask, Inputs(**part.inputs)
+        columns, length = mask.shape[1], inputs.tokens.shape[1]
+        left, right = used_columns(inputs.real, mask)
+        tokens, real = inputs.tokens[:, left:right], inputs.real[:, left:right]
+        lower = None if inputs.lower is None else inputs.lower[:, left:right]
         first = length - columns - left - 1  # the state in which the first response token is chosen
-        here = mask[:, : right + 1 - length + columns]
+        used = mask[:, : right + 1 - length + columns]
 
         def steps(hidden: Tensor) -> Tensor:
-            return hidden[:, first : first + here.shape[1]][here]
+            return hidden[:, first : first + used.shape[1]][used]
 
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.critic_alone):
-            hidden = roles.policy_hidden(tokens, real, lower)
-        support = part.inputs.get("support")
-        reference = part.inputs.get("ref_hidden") if self.exact else None
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.critic_only):
+            hidden = roles.policy.hidden(tokens, real, lower)
+        reference = inputs.ref_hidden if self.exact else None
         found = token_statistics(
             steps(hidden), roles.trunk.parts.head, part.actions[mask], roles.sampling,
-            support=None if support is None else support[mask],
+            support=None if inputs.support is None else inputs.support[mask],
             reference=None if reference is None else reference[mask],
-            reference_head=roles.head_of_reference(),
+            reference_head=roles.reference.trunk.parts.head,
             ahead=roles.settings.logp_alone,
         )  # fmt: skip
         values = found.logp.new_zeros(len(found.logp))
         if roles.critic_head is not None:
-            critic = roles.critic_hidden(hidden, tokens, real, lower)
+            critic = hidden if roles.critic is None else roles.critic.hidden(tokens, real, lower)
             values = roles.critic_head(steps(critic).float())[:, 0]
-        logp, entropy, kl, values = (_spread(x, mask) for x in (found.logp, found.entropy, found.kl, values))
-        return logp, entropy, kl, values
-
-
-def length_groups(real: Tensor, mask: Tensor) -> list[Tensor]:
-    """Rows [B] of about one length each, in as many groups as make the padded passes cheapest.
-
-    A group costs its rows times the longest prompt and the longest response among them, and a pass PASS
-    tokens more, however small it is.
-    """
-    prompts = real[:, : real.shape[1] - mask.shape[1]].sum(1)
-    places = torch.arange(1, mask.shape[1] + 1, device=mask.device)
-    responses = torch.where(mask, places, 0).amax(1)
-    order = (prompts + responses).argsort(stable=True)
-    sizes = torch.stack([prompts, responses])[:, order].cpu()
-
-    def cost(groups: int) -> int:
-        parts = sizes.tensor_split(groups, dim=1)
-        return sum(part.shape[1] * int(part.amax(1).sum()) + PASS for part in parts)
-
-    fewest = min(range(1, min(MOST_GROUPS, len(mask)) + 1), key=cost)
-    return list(order.tensor_split(fewest))
-
-
-def _spread(x: Tensor, mask: Tensor) -> Tensor:
-    """[N] numbers of the counting steps -> [B, R], 0 elsewhere."""
-    return torch.zeros(mask.shape, dtype=x.dtype, device=x.device).masked_scatter(mask, x)
-
-
-def trimmed(real: Tensor, mask: Tensor) -> tuple[int, int]:
-    """The columns [left, right) of [B, P + R] whose states matter: from the first real prompt token to the
-    token before the last counting one, in whose state that is chosen.
-    """
-    prompt = real.shape[1] - mask.shape[1]
-    any_prompt = real[:, :prompt].any(0).nonzero()
-    any_response = mask.any(0).nonzero()
-    left = int(any_prompt[0]) if len(any_prompt) else prompt - 1
-    right = prompt + (int(any_response[-1]) if len(any_response) else 0)
-    return left, right
+        zeros = torch.zeros(mask.shape, device=mask.device)
+        return FirstPass(
+            logp=zeros.masked_scatter(mask, found.logp),
+            entropy=zeros.masked_scatter(mask, found.entropy),
+            values=zeros.masked_scatter(mask, values),
+            kl=zeros.masked_scatter(mask, found.kl),
+        )

@@ -2,8 +2,8 @@
 
 policy     adapter "policy", the language-model head          (tune full: every weight)
 reference  the bare trunk, the same head                      (tune full: a frozen copy)
-critic     a head on the policy's hidden states | adapter "critic" and a head | a model of its own
-reward     adapter "reward" and a head | a model of its own | a function of the text
+critic     a head on the policy's hidden states | adapter "critic" and a head | a separate model
+reward     adapter "reward" and a head | a separate model | a function of the text
 """
 
 from __future__ import annotations
@@ -15,84 +15,54 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from tightrope.language.generation.distribution import Sampling
-from tightrope.language.memory.ledger import available_memory, check, job_of, ledger, reward_model_bytes
+from tightrope.language.memory import available_memory, check, job_of, ledger, reward_model_bytes
 from tightrope.language.model import lora
-from tightrope.language.model.load import (
-    eos_ids,
-    find_model,
-    load_causal,
-    load_tokenizer,
-    parameter_counts,
-    parts,
-    require_device,
-)
-from tightrope.language.model.reading import pretrained
-from tightrope.language.model.trunk import Trunk
+from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, require_device
+from tightrope.language.model.packaged import find_model
+from tightrope.language.model.parts import parameter_counts, parts
+from tightrope.language.model.saving import load_adapter
+from tightrope.language.model.trunk import Role, Trunk
 from tightrope.language.settings import AlignSettings
 
 
 @dataclass
 class Roles:
-    """The models of an alignment run. ``trunk`` is the policy's; what is None shares it."""
+    """The models of an alignment run, most of them on the policy's trunk.
+
+    ``critic``: None where its head reads the policy's hidden states, or where there is no critic.
+    """
 
     tokenizer: Any
-    trunk: Trunk
-    reference: Trunk | None
-    critic: Trunk | None
+    policy: Role
+    reference: Role
+    critic: Role | None
     critic_head: nn.Linear | None
     settings: AlignSettings
     sampling: Sampling
     eos: tuple[int, ...]
 
     @property
+    def trunk(self) -> Trunk:
+        """The policy's trunk."""
+        return self.policy.trunk
+
+    @property
     def model(self) -> Any:
         """The policy's model."""
-        return self.trunk.model
+        return self.policy.trunk.model
 
     def frozen_policy(self) -> contextlib.AbstractContextManager[None]:
-        """Inside, the model is the policy as it is now, its adapter folded in: to sample and to look, no
-        gradients.
-        """
-        return lora.folded(self.model, "policy" if self.reference is None else None)
-
-    def policy_hidden(self, tokens: Tensor, real: Tensor, lower: Tensor | None) -> Tensor:
-        """The policy's hidden states [B, T, d]."""
-        with lora.using(self.model, "policy" if self.reference is None else None):
-            return self.trunk.hidden(tokens, real, lower)
-
-    @torch.no_grad()
-    def reference_hidden(self, tokens: Tensor, real: Tensor, lower: Tensor | None) -> Tensor:
-        """The reference's hidden states [B, T, d]."""
-        if self.reference is not None:
-            return self.reference.hidden(tokens, real)
-        with lora.using(self.model, None):
-            return self.trunk.hidden(tokens, real, lower)
-
-    def adapter_hidden(self, name: str, tokens: Tensor, real: Tensor, lower: Tensor | None) -> Tensor:
-        """Hidden states [B, T, d] with an adapter of the shared trunk."""
-        with lora.using(self.model, name):
-            return self.trunk.hidden(tokens, real, lower)
-
-    def critic_hidden(self, policy: Tensor, tokens: Tensor, real: Tensor, lower: Tensor | None) -> Tensor:
-        """The hidden states from which the critic's head reads values; ``policy``: the policy's own."""
-        if self.critic is not None:
-            return self.critic.hidden(tokens, real)
-        return (
-            policy if self.settings.critic == "head" else self.adapter_hidden("critic", tokens, real, lower)
-        )
-
-    def head_of_reference(self) -> nn.Linear:
-        """The reference's language-model head; the policy's own where that is frozen."""
-        return self.trunk.parts.head if self.reference is None else self.reference.parts.head
+        """Inside, the model is the policy as it is now, its adapter folded in; without gradients."""
+        return lora.folded(self.model, self.policy.adapter)
 
     def critic_parameters(self) -> list[nn.Parameter]:
-        """What the critic alone trains."""
+        """What only the critic trains."""
         found = [] if self.critic_head is None else list(self.critic_head.parameters())
-        if self.critic is not None:
-            found += list(self.critic.parts.base.parameters())
+        if self.critic is not None and self.critic.adapter is None:
+            found += list(self.critic.trunk.parts.base.parameters())
         elif self.settings.critic == "adapter":
             found += lora.adapter_parameters(self.model, "critic")
         return found
@@ -102,8 +72,8 @@ class Roles:
         yield from self.model.named_parameters()
         if self.critic_head is not None:
             yield from self.critic_head.named_parameters("critic_head")
-        if self.critic is not None:
-            yield from self.critic.parts.base.named_parameters("critic")
+        if self.critic is not None and self.critic.adapter is None:
+            yield from self.critic.trunk.parts.base.named_parameters("critic")
 
     def lines(self) -> list[str]:
         """What is trained, in lines to show where a run begins."""
@@ -121,12 +91,9 @@ class Roles:
 
     def parameters(self) -> list[nn.Parameter]:
         """Everything that is trained: the policy's weights or adapter, then the critic's."""
-        own = (
-            list(self.model.parameters())
-            if self.settings.tune == "full"
-            else lora.adapter_parameters(self.model, "policy")
-        )
-        return own + self.critic_parameters()
+        if self.policy.adapter is None:
+            return list(self.model.parameters()) + self.critic_parameters()
+        return lora.adapter_parameters(self.model, self.policy.adapter) + self.critic_parameters()
 
 
 def make_roles(
@@ -149,7 +116,7 @@ def make_roles(
     kind = "separate" if guessed else "none" if reward_adapter is None else "adapter"
     present_memory(folder, settings, kind, notify, beside)
     tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
-    stops, cut, reference, critic = eos_ids(model, tokenizer), 0, None, None
+    stops, cut = eos_ids(model, tokenizer), 0
     if settings.tune == "lora":
         layers = lora.top_layers(model, settings.lora_layers)
         cut = layers[0]
@@ -157,26 +124,31 @@ def make_roles(
             seed = settings.seed * 10 + number
             lora.add_adapter(model, name, settings.lora_rank, settings.lora_alpha, layers, seed)
         if reward_adapter is not None:
-            lora.load_adapter(model, "reward", reward_adapter)
+            load_adapter(model, "reward", reward_adapter)
             cut = min(cut, lowest_layer(model, "reward"))
-    else:
-        reference = Trunk(load_causal(folder, dtype).to(device).requires_grad_(False))
     checkpointing = settings.gradient_checkpointing
-    if settings.critic == "separate":
-        critic = Trunk(load_causal(folder, dtype).to(device), checkpointing=checkpointing)
+    trunk = Trunk(model, cut, checkpointing=checkpointing)
+    policy, reference = Role(trunk, "policy"), Role(trunk)
+    if settings.tune == "full":
+        copy = load_causal(folder, dtype).to(device).requires_grad_(False)
+        policy, reference = Role(trunk), Role(Trunk(copy))
+    critic = None
+    if settings.critic == "adapter":
+        critic = Role(trunk, "critic")
+    elif settings.critic == "separate":
+        critic = Role(Trunk(load_causal(folder, dtype).to(device), checkpointing=checkpointing))
     head = None
     if settings.critic != "none":
         head = nn.Linear(model.config.hidden_size, 1).to(device)
-        nn.init.zeros_(head.weight)  # the first values are 0, whatever the trunk says
+        nn.init.zeros_(head.weight)  # the first values are 0, whatever the hidden states
         nn.init.zeros_(head.bias)
     sampling = Sampling(settings.temperature, settings.top_k, stops if settings.ignore_eos else ())
-    trunk = Trunk(model, cut, checkpointing=checkpointing)
-    return Roles(tokenizer, trunk, reference, critic, head, settings, sampling, stops)
+    return Roles(tokenizer, policy, reference, critic, head, settings, sampling, stops)
 
 
 def judges_of(settings: AlignSettings, own_reward: bool) -> list[Path]:
     """The folders of reward models that the settings name and that have a trunk of their own: the reward
-    where ``own_reward`` says so, the gold judge always.
+    with ``own_reward``, the gold judge always.
     """
     named = [settings.reward if own_reward else None, settings.gold]
     return [Path(name) for name in named if name and Path(name).is_dir()]

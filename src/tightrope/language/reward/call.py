@@ -1,4 +1,9 @@
-"""One call of a reward function: what it is given, and what came back, before anything is believed."""
+"""One call of a reward function: what it is given, how long it may take, and what came back.
+
+Python cannot kill a thread. A call that is not back at its deadline is left behind in a daemon thread, which
+stops neither the program nor the end of the process; what it returns later is thrown away. A plain function
+is not called again before it is back, so that at most one thread a function is lost.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +13,19 @@ import inspect
 import itertools
 import math
 import numbers
+import queue
+import threading
 import traceback
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
+import weakref
+from collections.abc import Callable, Coroutine, Iterable, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+T = TypeVar("T")
 Text = str | list[dict[str, Any]]
 RewardFunction = Callable[..., Any]
 FaultKind = Literal["exception", "length", "type", "not finite", "timeout", "none"]
@@ -23,12 +33,12 @@ LARGEST = 1e30  # above it a score, or a sum of weighted ones, would be infinite
 
 
 class RewardError(ValueError):
-    """A reward function cannot be used as it is; the message names it, and says what to do."""
+    """A reward function cannot be used as it is; the message names it and what to do."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Why samples are masked: ``function`` did not score ``samples``, ``text`` says how.
+    """Why samples are masked: ``function`` did not score ``samples``, ``text`` is the reason.
 
     ``kind`` "none": every function returned None for them; ``function`` is then empty.
     """
@@ -66,7 +76,7 @@ class Log:
 
     def metric(self, name: str, value: float) -> None:
         """Add one value of a metric; values of one name are averaged. TypeError unless it is a number."""
-        found = number(value)
+        found = as_number(value)
         if found is None:
             raise TypeError(f"log_metric({name!r}) got None, expected a number.")
         self._metrics.setdefault(str(name), []).append(found)
@@ -77,34 +87,39 @@ class Log:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Result:
     """What came back in time: ``values``, one entry per response, or the ``error`` that was raised."""
 
-    log: Log
     values: list[Any] | None = None
     error: BaseException | None = None
 
 
-def answer_of(call: Callable[[], Any], log: Log, count: int) -> Answer:
-    """The answer of a plain function, whatever it does; reading its values is part of the call."""
-    try:
-        return Answer(log, values=_listed(call(), count))
-    except (Exception, SystemExit) as error:  # user code: what it raises is reported by whoever asked
-        return Answer(log, error=error)
+class Call:
+    """One function, called for one batch.
 
+    ``offered``: the arguments it may take, of which it gets copies that it may change. RewardError when it
+    wants one that is not offered.
+    """
 
-def awaiting(
-    call: Callable[[], Awaitable[Any]], log: Log, count: int
-) -> Callable[[], Coroutine[Any, Any, Answer]]:
-    """The same for an async function, as a coroutine function without arguments."""
+    def __init__(self, name: str, function: RewardFunction, offered: dict[str, Any], count: int) -> None:
+        self.log, self._function, self._count = Log(count), function, count
+        copies = {key: _copied(value) for key, value in offered.items()}
+        copies |= {"log_extra": self.log.extra, "log_metric": self.log.metric}
+        self._arguments = _accepted(name, function, copies)
 
-    async def answer() -> Answer:
+    def run(self) -> Result:
+        """Call a plain function, whatever it does; reading its values is part of the call."""
         try:
-            return Answer(log, values=_listed(await call(), count))
-        except (Exception, SystemExit, asyncio.CancelledError) as error:
-            return Answer(log, error=error)
+            return Result(values=_as_list(self._function(**self._arguments), self._count))
+        except (Exception, SystemExit) as error:  # user code: what it raises is reported by the caller
+            return Result(error=error)
 
-    return answer
+    async def run_async(self) -> Result:
+        """The same for an async function."""
+        try:
+            return Result(values=_as_list(await self._function(**self._arguments), self._count))
+        except (Exception, SystemExit, asyncio.CancelledError) as error:
+            return Result(error=error)
 
 
 def is_async(function: RewardFunction) -> bool:
@@ -114,7 +129,87 @@ def is_async(function: RewardFunction) -> bool:
     )
 
 
-def accepted(name: str, function: RewardFunction, offered: dict[str, Any]) -> dict[str, Any]:
+def as_number(value: Any) -> float | None:
+    """A score as a float, None for None. TypeError for what is no real number.
+
+    Whole numbers, truth values and scalars of numpy and torch are numbers; text is none, also "0.5".
+    """
+    if value is None:
+        return None
+    if hasattr(value, "item") and getattr(value, "shape", None) == ():
+        value = value.item()
+    if not isinstance(value, numbers.Real):
+        raise TypeError(f"{value!r} is no number")
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf  # too large for a float, of whichever sign: unusable all the same
+
+
+def describe_error(error: BaseException) -> str:
+    """``KeyError: 'answer' (line 12 of rewards.py)``: the innermost line of the user's own file."""
+    message = (str(error).splitlines() or [""])[0][:200]
+    text = type(error).__name__ + (f": {message}" if message else "")
+    ours = (str(Path(__file__).parent), "<frozen")  # and those of the import machinery
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(ours)]
+    if not frames:
+        return text
+    line = [frame.lineno for frame in frames if frame.filename == frames[0].filename][-1]
+    return f"{text} (line {line} of {Path(frames[0].filename).name})"
+
+
+def usable_scores(
+    name: str, weight: float, result: Result | None, completions: Sequence[Text], timeout: float | None
+) -> tuple[np.ndarray, list[Fault]]:
+    """The usable scores of one function, [B] float64 with NaN for the others, and the faults, one a kind.
+
+    ``result`` None: it was not back in time. A score of None gives NaN without a fault: the function does not
+    apply. ``weight`` is read only for the size of a score.
+    """
+    part, everything = np.full(len(completions), np.nan), tuple(range(len(completions)))
+
+    def fault(kind: FaultKind, samples: Sequence[int], text: str) -> Fault:
+        return Fault(name, kind, tuple(samples), f"Reward function {name!r} {text}")
+
+    if result is None:
+        text = f"was not back after {timeout:g} s. Make it faster, or allow it a longer timeout."
+        return part, [fault("timeout", everything, text)]
+    if isinstance(result.error, NoScores):
+        return part, [fault(result.error.kind, everything, str(result.error))]
+    if result.error is not None:
+        return part, [fault("exception", everything, f"raised {describe_error(result.error)}.")]
+    values = result.values or []
+    bad: dict[FaultKind, list[int]] = {}
+    for sample, value in enumerate(values):
+        try:
+            score = as_number(value)
+        except TypeError:
+            bad.setdefault("type", []).append(sample)
+            continue
+        if score is None:
+            continue
+        if abs(weight * score) <= LARGEST:  # False for NaN and infinity, also under the weight 0
+            part[sample] = score
+        else:
+            bad.setdefault("not finite", []).append(sample)
+    faults = []
+    for kind, samples in bad.items():
+        first = values[samples[0]]
+        shown = f"the {type(first).__name__} {str(first)[:60]!r}" if kind == "type" else f"{first}"
+        text = f"returned {shown} for {where(samples, completions)}, expected a finite number or None."
+        faults.append(fault(kind, samples, text))
+    return part, faults
+
+
+def where(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:
+    """``sample 3 of 64 and 5 more (response 'The film ...')``; counted from 0."""
+    text = completions[samples[0]]
+    shown = repr((text if isinstance(text, str) else str(text))[:60])
+    more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
+    return f"sample {samples[0]} of {len(completions)}{more} (response {shown})"
+
+
+def _accepted(name: str, function: RewardFunction, offered: dict[str, Any]) -> dict[str, Any]:
     """The arguments among those offered that the function's signature takes; all of them with ``**columns``.
 
     RewardError when it wants one that is not offered.
@@ -142,42 +237,8 @@ def accepted(name: str, function: RewardFunction, offered: dict[str, Any]) -> di
     return {key: value for key, value in offered.items() if key in taken}
 
 
-def own_copy(text: Text) -> Text:
-    """A prompt or response that its reader may change."""
-    return text if isinstance(text, str) else [dict(message) for message in text]
-
-
-def number(value: Any) -> float | None:
-    """A score as a float, None for None. TypeError for what is no real number.
-
-    Whole numbers, truth values and scalars of numpy and torch are numbers; text is none, also "0.5".
-    """
-    if value is None:
-        return None
-    if hasattr(value, "item") and getattr(value, "shape", None) == ():
-        value = value.item()
-    if not isinstance(value, numbers.Real):
-        raise TypeError(f"{value!r} is no number")
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf  # too large for a float, of whichever sign: unusable all the same
-
-
-def told(error: BaseException) -> str:
-    """``KeyError: 'answer' (line 12 of rewards.py)``: the innermost line of the user's own file."""
-    message = (str(error).splitlines() or [""])[0][:200]
-    text = type(error).__name__ + (f": {message}" if message else "")
-    ours = (str(Path(__file__).parent), "<frozen")  # and those of the import machinery
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(ours)]
-    if not frames:
-        return text
-    line = [frame.lineno for frame in frames if frame.filename == frames[0].filename][-1]
-    return f"{text} (line {line} of {Path(frames[0].filename).name})"
-
-
-def _listed(result: Any, count: int) -> list[Any]:
-    """What a function returned, as a list of ``count`` entries that are still to be judged."""
+def _as_list(result: Any, count: int) -> list[Any]:
+    """What a function returned, as a list of ``count`` entries that are not checked yet."""
     expected = f"expected a list of {count}, one number or None per response, in their order."
     if inspect.isawaitable(result):
         if inspect.iscoroutine(result):
@@ -196,39 +257,93 @@ def _listed(result: Any, count: int) -> list[Any]:
     return values
 
 
-def judged(
-    name: str, weight: float, values: list[Any], completions: Sequence[Text]
-) -> tuple[np.ndarray, list[Fault]]:
-    """The usable scores of one function, [B] float64 with NaN for the others, and the faults, one a kind.
+def _copied(value: Any) -> Any:
+    """A list, and the lists and messages directly in it, copied; anything else as it is."""
+    if type(value) is not list:
+        return value
+    return [[_message_copied(part) for part in item] if type(item) is list else item for item in value]
 
-    None gives NaN without a fault: the function does not apply. ``weight`` matters for the size alone.
+
+def _message_copied(part: Any) -> Any:
+    return dict(part) if type(part) is dict else part
+
+
+class Overdue(Exception):
+    """A call was not back at its deadline."""
+
+
+class Worker:
+    """A daemon thread that calls functions one after the other; it begins with the first call."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._jobs: queue.SimpleQueue[Any] | None = None
+
+    def call(self, function: Callable[[], T], timeout: float) -> T:
+        """What ``function()`` returns, or raises. Raises Overdue after ``timeout`` seconds, waiting for an
+        earlier call included; a call that has not begun by then never begins.
+        """
+        if self._jobs is None:
+            self._jobs = queue.SimpleQueue()
+            threading.Thread(target=_work, args=(self._jobs,), name=self._name, daemon=True).start()
+            weakref.finalize(self, self._jobs.put, None)
+        future: Future[T] = Future()
+        self._jobs.put((future, function))
+        _, late = wait([future], timeout)
+        if late and (future.cancel() or future.running()):
+            raise Overdue
+        return future.result()
+
+
+def _work(jobs: queue.SimpleQueue[Any]) -> None:
+    while True:
+        job = jobs.get()
+        if job is None:
+            return
+        future, function = job
+        if future.set_running_or_notify_cancel():
+            try:
+                future.set_result(function())
+            except BaseException as error:  # whatever it is, the caller gets it
+                future.set_exception(error)
+        del job, future, function  # a waiting thread must not keep a batch in memory
+
+
+class EventLoop:
+    """An event loop in a daemon thread, the same one for every call; it begins with the first call.
+
+    The loop lives on between calls, because clients that user code keeps (HTTP sessions) belong to the loop
+    they were made in. It also works where the caller is inside an event loop already, as in a notebook.
     """
-    part = np.full(len(values), np.nan)
-    bad: dict[FaultKind, list[int]] = {}
-    for sample, value in enumerate(values):
-        try:
-            score = number(value)
-        except TypeError:
-            bad.setdefault("type", []).append(sample)
-            continue
-        if score is None:
-            continue
-        if abs(weight * score) <= LARGEST:  # False for NaN and infinity, under the weight 0, too
-            part[sample] = score
-        else:
-            bad.setdefault("not finite", []).append(sample)
-    faults = []
-    for kind, samples in bad.items():
-        first = values[samples[0]]
-        shown = f"the {type(first).__name__} {str(first)[:60]!r}" if kind == "type" else f"{first}"
-        text = f"returned {shown} for {place(samples, completions)}, expected a finite number or None."
-        faults.append(Fault(name, kind, tuple(samples), text))
-    return part, faults
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def call(
+        self, functions: Sequence[Callable[[], Coroutine[Any, Any, T]]], timeout: float | None
+    ) -> list[T | None]:
+        """What the coroutines of all functions return, run together; None for each that is not back in time.
+
+        A late one is cancelled. One that blocks the loop makes all the others late, too: Python runs them in
+        one thread. Raises what a coroutine raises.
+        """
+        if self._loop is None:
+            self._loop = asyncio.new_event_loop()
+            threading.Thread(target=_run_event_loop, args=(self._loop,), name=self._name, daemon=True).start()
+            weakref.finalize(self, self._loop.call_soon_threadsafe, self._loop.stop)
+        futures = [asyncio.run_coroutine_threadsafe(function(), self._loop) for function in functions]
+        wait(futures, timeout)
+        return [None if future.cancel() else future.result() for future in futures]
 
 
-def place(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:
-    """``sample 3 of 64 and 5 more (response 'The film ...')``; counted from 0."""
-    text = completions[samples[0]]
-    shown = repr((text if isinstance(text, str) else str(text))[:60])
-    more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
-    return f"sample {samples[0]} of {len(completions)}{more} (response {shown})"
+def _run_event_loop(loop: asyncio.AbstractEventLoop) -> None:
+    asyncio.set_event_loop(loop)
+    loop.run_forever()
+    left = asyncio.all_tasks(loop)
+    for task in left:
+        task.cancel()
+    if left:
+        loop.run_until_complete(asyncio.wait(left, timeout=1.0))
+    loop.run_until_complete(loop.shutdown_asyncgens())
+    loop.close()

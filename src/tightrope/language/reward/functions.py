@@ -3,18 +3,20 @@
     def reward(prompts, completions, completion_ids, **columns) -> list[float | None]
 
 A function may be plain or ``async``; all arguments are passed by keyword. What it may not do is spoil a run:
-one that hangs, raises, or returns NaN or the wrong number of scores ends in a `RewardError` that names it or
+one that hangs, raises, or returns NaN or the wrong number of scores ends in a `RewardError` that names it, or
 in samples that are masked and counted, never in a wrong number.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import inspect
+import itertools
 import math
 import re
 import sys
-from collections.abc import Callable, Container, Coroutine, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,25 +25,22 @@ from typing import Any, Literal
 import numpy as np
 
 from tightrope.language.reward.call import (
-    Answer,
+    Call,
+    EventLoop,
     Fault,
     FaultKind,
-    Log,
-    NoScores,
+    Overdue,
+    Result,
     RewardError,
     RewardFunction,
     Text,
-    accepted,
-    answer_of,
-    awaiting,
+    Worker,
+    as_number,
+    describe_error,
     is_async,
-    judged,
-    number,
-    own_copy,
-    place,
-    told,
+    usable_scores,
+    where,
 )
-from tightrope.language.reward.deadline import Loop, Overdue, Worker
 
 # What is a mistake in the code raises by default; what the data or the world does masks the samples.
 RAISES: tuple[FaultKind, ...] = ("exception", "length", "type")
@@ -104,7 +103,7 @@ class Rewards:
             raise ValueError(f"on_error is {on_error!r}, expected 'mask', 'raise' or None.")
         self.timeout, self.on_error, self.alone = timeout, on_error, alone
         self._workers = [Worker(f"reward {name}") for name in self.names]
-        self._loop = Loop("async rewards")
+        self._loop = EventLoop("async rewards")
         self._empty_batches = 0
 
     def score(
@@ -117,7 +116,7 @@ class Rewards:
     ) -> Scores:
         """Score B responses. ``columns``: the data's other columns, B entries each.
 
-        Functions may change the lists they are given: each has its own. Raises RewardError as the class says,
+        Functions may change the lists they are given: each gets copies. Raises RewardError as above,
         for a function that wants what is not offered, and when three batches in a row have not one valid
         sample: nothing would be learnt. Raises ValueError when lengths differ, or a column has the name of
         an argument.
@@ -131,54 +130,53 @@ class Rewards:
             raise ValueError(
                 f"The data's column {taken[0]!r} has the name of an argument; rename the column."
             )
-        logs = [Log(len(prompts)) for _ in self.names]
-        calls = []
-        for name, function, log in zip(self.names, self.functions, logs, strict=True):
-            offered = {
-                "prompts": [own_copy(text) for text in prompts],
-                "completions": [own_copy(text) for text in completions],
-                "completion_ids": [list(ids) for ids in completion_ids],
-                "trainer_state": trainer_state,
-                "log_extra": log.extra,
-                "log_metric": log.metric,
-                **{column: list(values) for column, values in columns.items()},
-            }
-            calls.append(partial(function, **accepted(name, function, offered)))
-        answers = self._answers(calls, logs, len(prompts)) if len(prompts) else []
-        scores = self._joined(answers, completions)
+        offered = {
+            "prompts": list(prompts),
+            "completions": list(completions),
+            "completion_ids": [list(ids) for ids in completion_ids],
+            "trainer_state": trainer_state,
+            **columns,
+        }
+        calls = [
+            Call(name, function, offered, len(prompts))
+            for name, function in zip(self.names, self.functions, strict=True)
+        ]
+        results = self._results(calls) if len(prompts) else []
+        scores = self._joined(calls, results, completions)
         self._refuse_to_learn_nothing(scores)
         return scores
 
-    def _answers(self, calls: list[partial[Any]], logs: list[Log], count: int) -> list[Answer | None]:
-        """Every function's answer, None for a late one: plain ones in order, then async ones together."""
-        answers: list[Answer | None] = [None] * len(calls)
-        later: dict[int, Callable[[], Coroutine[Any, Any, Answer]]] = {}
-        for index, (call, log) in enumerate(zip(calls, logs, strict=True)):
+    def _results(self, calls: list[Call]) -> list[Result | None]:
+        """Every function's result, None for a late one: plain ones in order, then async ones together."""
+        results: list[Result | None] = [None] * len(calls)
+        later = []
+        for index, call in enumerate(calls):
             if is_async(self.functions[index]):
-                later[index] = awaiting(call, log, count)
+                later.append(index)
             elif self.timeout is None:
-                answers[index] = answer_of(call, log, count)
+                results[index] = call.run()
             else:
-                try:
-                    whole_call = partial(answer_of, call, log, count)
-                    answers[index] = self._workers[index].call(whole_call, self.timeout)
-                except Overdue:
-                    continue
+                with contextlib.suppress(Overdue):
+                    results[index] = self._workers[index].call(call.run, self.timeout)
         if later:
-            for index, answer in zip(later, self._loop.call(list(later.values()), self.timeout), strict=True):
-                answers[index] = answer
-        return answers
+            found = self._loop.call([calls[index].run_async for index in later], self.timeout)
+            for index, result in zip(later, found, strict=True):
+                results[index] = result
+        return results
 
-    def _joined(self, answers: list[Answer | None], completions: Sequence[Text]) -> Scores:
+    def _joined(self, calls: list[Call], results: list[Result | None], completions: Sequence[Text]) -> Scores:
+        """All functions' scores, weighted and added up. RewardError for a fault that the settings raise."""
         count = len(completions)
-        total, parts = np.zeros(count), {name: np.full(count, np.nan) for name in self.names}
-        applies, broken = np.zeros(count, bool), np.zeros(count, bool)
+        total, applies, broken = np.zeros(count), np.zeros(count, bool), np.zeros(count, bool)
+        parts = {name: np.full(count, np.nan) for name in self.names}
         metrics: dict[str, float] = {}
         extras: dict[str, list[Any]] = {}
         faults: list[Fault] = []
-        for name, weight, answer in zip(self.names, self.weights, answers, strict=False):
-            part, found = self._judged(name, weight, answer, completions)
+        for name, weight, call, result in zip(self.names, self.weights, calls, results, strict=False):
+            part, found = usable_scores(name, weight, result, completions, self.timeout)
             for fault in found:
+                if self.on_error == "raise" or (self.on_error is None and fault.kind in RAISES):
+                    raise RewardError(fault.text) from (None if result is None else result.error)
                 broken[list(fault.samples)] = True
                 counter = f"rewards/{name}/{'timeouts' if fault.kind == 'timeout' else 'errors'}"
                 metrics[counter] = metrics.get(counter, 0.0) + len(fault.samples)
@@ -189,41 +187,18 @@ class Rewards:
             parts[name] = part
             if scored.any():
                 metrics[f"scores/{name}"] = float(part[scored].mean())
-            if answer is not None and answer.error is None:
-                metrics |= {f"logged/{key}": value for key, value in answer.log.means().items()}
+            if result is not None and result.error is None:
+                metrics |= {f"logged/{key}": value for key, value in call.log.means().items()}
                 extras |= {
                     f"{column} ({name})" if column in extras else column: entries
-                    for column, entries in answer.log.extras.items()
+                    for column, entries in call.log.extras.items()
                 }
         nobody = np.flatnonzero(~applies & ~broken)
         if len(nobody):
-            text = f"No reward function applies to {place(nobody, completions)}: all returned None."
+            text = f"No reward function applies to {where(nobody, completions)}: all returned None."
             faults.append(Fault("", "none", tuple(nobody.tolist()), text))
         valid = applies & ~broken
         return Scores(np.where(valid, total, np.nan), valid, parts, metrics, extras, faults)
-
-    def _judged(
-        self, name: str, weight: float, answer: Answer | None, completions: Sequence[Text]
-    ) -> tuple[np.ndarray, list[Fault]]:
-        """One function's scores [B], NaN where there is none, and what is wrong with them. Raises RewardError
-        where the settings say so.
-        """
-        part, everything = np.full(len(completions), np.nan), tuple(range(len(completions)))
-        error = answer.error if answer is not None else None
-        if answer is None:
-            text = f"was not back after {self.timeout:g} s. Make it faster, or allow it a longer timeout."
-            faults = [Fault(name, "timeout", everything, text)]
-        elif isinstance(error, NoScores):
-            faults = [Fault(name, error.kind, everything, str(error))]
-        elif error is not None:
-            faults = [Fault(name, "exception", everything, f"raised {told(error)}.")]
-        else:
-            part, faults = judged(name, weight, answer.values or [], completions)
-        faults = [Fault(f.function, f.kind, f.samples, f"Reward function {name!r} {f.text}") for f in faults]
-        for fault in faults:
-            if self.on_error == "raise" or (self.on_error is None and fault.kind in RAISES):
-                raise RewardError(fault.text) from error
-        return part, faults
 
     def _refuse_to_learn_nothing(self, scores: Scores) -> None:
         lost = self.alone or any(fault.kind != "none" for fault in scores.faults)
@@ -254,35 +229,32 @@ def _checked_function(function: Any) -> RewardFunction:
 
 def checked_weight(weight: Any) -> float:
     """The weight as a float. ValueError for what is no finite number."""
-    value = None if isinstance(weight, str) else number(weight)
+    value = None if isinstance(weight, str) else as_number(weight)
     if value is None or not math.isfinite(value):
         raise ValueError(f"The weight of a reward function is {weight!r}, expected a finite number.")
     return value
 
 
 def _checked_names(functions: list[RewardFunction], names: Sequence[str] | None) -> list[str]:
-    """The names given, or the functions' own words; equal ones are numbered."""
+    """The names given, or those of the functions; equal ones are numbered."""
     if not functions:
         raise ValueError("There is no reward function. Give at least one callable.")
     if names is not None:
         if len(names) != len(functions) or len(set(names)) != len(names) or not all(names):
             raise ValueError(f"The reward names are {list(names)}, expected {len(functions)} different ones.")
         return list(names)
-    own: list[str] = []
+    found: list[str] = []
     for function in functions:
         plain = function.func if isinstance(function, partial) else function
         word = re.sub(r"\W+", "_", getattr(plain, "__name__", type(plain).__name__)).strip("_") or "reward"
-        own.append(unlike(own, word))
-    return own
+        found.append(unique_name(found, word))
+    return found
 
 
-def unlike(taken: Container[str], word: str) -> str:
+def unique_name(taken: Container[str], word: str) -> str:
     """The word, with a number where it is taken."""
-    name, same = word, 1
-    while name in taken:
-        same += 1
-        name = f"{word}_{same}"
-    return name
+    names = itertools.chain([word], (f"{word}_{count}" for count in itertools.count(2)))
+    return next(name for name in names if name not in taken)
 
 
 def length(completion_ids: list[list[int]], **_: Any) -> list[float]:
@@ -306,7 +278,7 @@ def load_reward_function(word: str) -> RewardFunction:
     path = Path(file)
     if not path.is_file():
         raise RewardError(f"The reward {word!r}: there is no file {file}.")
-    # a name of its own, so that a file called json.py does not take the place of a module in use
+    # a separate name, so that a file called json.py does not take the place of a module in use
     spec = importlib.util.spec_from_file_location(f"reward_file_{path.stem}", path.resolve())
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -316,11 +288,11 @@ def load_reward_function(word: str) -> RewardFunction:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[spec.name]
-        raise RewardError(f"The reward {word!r}: the file cannot be run, {told(error)}.") from error
+        raise RewardError(f"The reward {word!r}: the file cannot be run, {describe_error(error)}.") from error
     function = getattr(module, name, None)
     if not callable(function):
-        own = [key for key, value in vars(module).items() if inspect.isfunction(value) and key[0] != "_"]
+        there = [key for key, value in vars(module).items() if inspect.isfunction(value) and key[0] != "_"]
         raise RewardError(
-            f"The reward {word!r}: {path.name} has no function {name!r}; it has {', '.join(own) or 'none'}."
+            f"The reward {word!r}: {path.name} has no function {name!r}; it has {', '.join(there) or 'none'}."
         )
     return function

@@ -14,13 +14,19 @@ from torch import Tensor
 
 from tightrope.algorithms.memory import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
-from tightrope.language.generation.completions import Answers
+from tightrope.language.generation.sample import Completions
 from tightrope.language.model import lora
-from tightrope.language.model.load import fingerprint
-from tightrope.language.model.reading import read_metadata, read_tensors
+from tightrope.language.model.load import fingerprint, read_metadata, read_tensors
+from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.call import Fault, RewardError
-from tightrope.language.reward.functions import Rewards, Scores, checked_weight, load_reward_function, unlike
+from tightrope.language.reward.functions import (
+    Rewards,
+    Scores,
+    checked_weight,
+    load_reward_function,
+    unique_name,
+)
 from tightrope.language.reward.model import RewardModel, last_real, load_reward
 
 
@@ -42,7 +48,7 @@ class Judge:
         self.roles, self.functions, self.model, self.adapter = roles, functions, model, adapter
         self.weight = weight
 
-    def __call__(self, prompts: Sequence[Prompt], answers: Answers, trainer_state: Any = None) -> Scores:
+    def __call__(self, prompts: Sequence[Prompt], answers: Completions, trainer_state: Any = None) -> Scores:
         """Scores of the responses to ``prompts``, one prompt a response."""
         found = self._of_functions(prompts, answers, trainer_state)
         try:
@@ -59,7 +65,7 @@ class Judge:
         assert found is not None
         return found
 
-    def _of_functions(self, prompts: Sequence[Prompt], answers: Answers, state: Any) -> Scores | None:
+    def _of_functions(self, prompts: Sequence[Prompt], answers: Completions, state: Any) -> Scores | None:
         if self.functions is None:
             return None
         ids = answers.ids()
@@ -73,7 +79,7 @@ class Judge:
         return self.functions.score([p.shown for p in prompts], completions, ids, columns, state)
 
     @torch.no_grad()
-    def _of_model(self, answers: Answers) -> np.ndarray | None:
+    def _of_model(self, answers: Completions) -> np.ndarray | None:
         if self.model is None and self.adapter is None:
             return None
         size = self.roles.settings.update.micro_batch_size or len(answers.tokens)
@@ -87,7 +93,7 @@ class Judge:
             assert self.adapter is not None
             head, shift = self.adapter
             lower = None if answers.lower is None else answers.lower[rows]
-            hidden = self.roles.adapter_hidden("reward", tokens, real, lower)
+            hidden = Role(self.roles.trunk, "reward").hidden(tokens, real, lower)
             scores.append((last_real(hidden, real).float() @ head.float().T)[:, 0] - shift)
         return torch.cat(scores).double().cpu().numpy()
 
@@ -95,7 +101,7 @@ class Judge:
 def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) -> Scores:
     """The functions' scores and a reward model's, [B], added up.
 
-    Where no function applies the model's stands alone. A score of the model that is not finite masks its
+    Where no function applies only the model's score counts. A score of the model that is not finite masks its
     response. RewardError when none is finite: the model is broken.
     """
     good = np.isfinite(learnt)
@@ -106,10 +112,10 @@ def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) ->
         )
     if found is None:
         found = Scores(np.zeros(len(learnt)), np.ones(len(learnt), bool), {}, {}, {})
-    alone = np.zeros(len(learnt), bool)
-    alone[[sample for fault in found.faults if fault.kind == "none" for sample in fault.samples]] = True
-    valid = (found.valid | alone) & good
-    part, name = np.where(good, learnt, np.nan), unlike(found.parts, "reward_model")
+    model_only = np.zeros(len(learnt), bool)
+    model_only[[sample for fault in found.faults if fault.kind == "none" for sample in fault.samples]] = True
+    valid = (found.valid | model_only) & good
+    part, name = np.where(good, learnt, np.nan), unique_name(found.parts, "reward_model")
     faults = [fault for fault in found.faults if fault.kind != "none"]
     if not good.all():
         bad = tuple(np.flatnonzero(~good).tolist())
@@ -117,7 +123,7 @@ def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) ->
         text = f"The reward model gave {learnt[bad[0]]} for {where}, expected a finite number."
         faults.append(Fault(name, "not finite", bad, text))
     return Scores(
-        total=np.where(valid, np.where(alone, 0.0, found.total) + weight * part, np.nan),
+        total=np.where(valid, np.where(model_only, 0.0, found.total) + weight * part, np.nan),
         valid=valid,
         parts={**found.parts, name: part},
         metrics={**found.metrics, f"scores/{name}": float(part[good].mean())},
@@ -235,7 +241,7 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
         model = judge.model or load_reward(folder)
         weight, shift = model.head.weight, model.shift
         try:
-            roles.critic.parts.base.load_state_dict(model.base.state_dict())
+            roles.critic.trunk.parts.base.load_state_dict(model.base.state_dict())
         except RuntimeError as error:
             raise ValueError(
                 f"critic_from_reward: the reward model {folder} is built otherwise than the critic, which is "

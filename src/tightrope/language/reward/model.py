@@ -8,12 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.data.padding import positions
-from tightrope.language.model.load import fused, load_tokenizer, without_dropout
-from tightrope.language.model.reading import pretrained, read_object
+from tightrope.language.data.batching import positions
+from tightrope.language.model.load import fused, load_tokenizer, pretrained, read_object, without_dropout
 from tightrope.language.quiet import quiet
 
-SHIFT = "tightrope_reward_shift"  # in config.json: score = what the head says - shift
+SHIFT = "tightrope_reward_shift"  # in config.json: score = output of the head - shift
 
 
 def last_real(hidden: Tensor, real: Tensor) -> Tensor:
@@ -36,7 +35,7 @@ class RewardModel:
         return self
 
     def raw(self, tokens: Tensor, real: Tensor, *, right: bool = False) -> Tensor:
-        """Scores [B] before the shift, differentiable. ``right``: all padding stands behind the text, where
+        """Scores [B] before the shift, differentiable. ``right``: all padding follows the text, where
         causal attention never looks, and no mask is needed.
         """
         mask: dict[str, Tensor] = {}

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from tightrope.algorithms.memory import Parts
 from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam, Brake, Meter
-from tightrope.language.data.split import Item
+from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.history import Checkpoint
@@ -89,7 +89,7 @@ class SupervisedLearner:
         return self.steps_per_epoch * self.settings.num_epochs
 
     @property
-    def done(self) -> bool:
+    def complete(self) -> bool:
         """Whether every epoch is over."""
         return self.step >= self.total
 

@@ -17,11 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.data.examples import Pair, preference_pairs, read_rows, sft_examples
-from tightrope.language.data.padding import pad_right
-from tightrope.language.data.split import hold_out
+from tightrope.language.data.batching import pad_right
+from tightrope.language.data.examples import Pair, hold_out, preference_pairs, read_rows, sft_examples
 from tightrope.language.model import lora
-from tightrope.language.model.load import parts
+from tightrope.language.model.parts import parts
 from tightrope.language.quiet import quiet
 from tightrope.language.reward.model import RewardModel
 from tightrope.language.settings import RewardSettings

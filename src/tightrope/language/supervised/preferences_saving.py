@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.model import lora
-from tightrope.language.model.load import fingerprint
-from tightrope.language.model.reading import without_weights
+from tightrope.language.model.load import fingerprint, without_weights
+from tightrope.language.model.saving import save_adapter
 from tightrope.language.reward.model import SHIFT
 from tightrope.language.supervised.prepare import Loaded
 from tightrope.runs.durable import whole
@@ -65,7 +65,7 @@ def _save_adapter(folder: Path, head: Tensor, shift: float, loaded: Loaded) -> N
     from safetensors.torch import load_file, save_file
 
     assert loaded.adapter is not None
-    lora.save_adapter(loaded.model, loaded.adapter, folder, base_model=loaded.source, task_type="SEQ_CLS")
+    save_adapter(loaded.model, loaded.adapter, folder, base_model=loaded.source, task_type="SEQ_CLS")
     score = head.cpu().contiguous()
     weights = load_file(folder / "adapter_model.safetensors")
     weights["base_model.model.score.weight"] = score

@@ -9,18 +9,18 @@ from typing import Any, NamedTuple
 import torch
 
 from tightrope.language.data.examples import Row, read_rows
-from tightrope.language.memory.ledger import available_memory, check, job_of, ledger
+from tightrope.language.memory import available_memory, check, job_of, ledger
 from tightrope.language.model import lora
 from tightrope.language.model.load import (
-    context_length,
     eos_ids,
-    find_model,
     load_causal,
     load_tokenizer,
+    pretrained,
     require_device,
     without_dropout,
 )
-from tightrope.language.model.reading import pretrained
+from tightrope.language.model.packaged import find_model
+from tightrope.language.model.parts import context_length
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs import signals
 from tightrope.training.events import Listeners

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from torch import nn
 
-from tightrope.language.model.load import parameter_counts
+from tightrope.language.model.parts import parameter_counts
 from tightrope.language.settings import SupervisedSettings
 from tightrope.language.supervised.fit import Objective, SupervisedLearner
 from tightrope.language.supervised.prepare import Loaded

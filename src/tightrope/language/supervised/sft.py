@@ -12,14 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tightrope.language.data.examples import Example, Row, read_rows, sft_examples
-from tightrope.language.data.packing import Packed, attention_of, collate, pack, row_of
-from tightrope.language.data.split import hold_out
-from tightrope.language.generation.distribution import Sampling
-from tightrope.language.generation.token_stats import token_statistics
+from tightrope.language.data.batching import Example, Packed, attention_of, collate, pack, row_of
+from tightrope.language.data.examples import Row, hold_out, read_rows, sft_examples
+from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.model import lora
-from tightrope.language.model.load import attention_window, parts
-from tightrope.language.model.saving import write_model
+from tightrope.language.model.parts import attention_window, parts
+from tightrope.language.model.saving import save_adapter, write_model
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, micro_batches
@@ -156,7 +154,7 @@ def _train(
         write_model(model, loaded.tokenizer, folder / "model", loaded.adapter)
         if loaded.adapter is not None:
             with whole(folder / "adapter") as inner:
-                lora.save_adapter(model, loaded.adapter, inner, base_model=loaded.source)
+                save_adapter(model, loaded.adapter, inner, base_model=loaded.source)
         return {"rows": len(rows), "held_out_rows": len(held), "tokens": learnt}
 
     parameters = list(model.parameters())

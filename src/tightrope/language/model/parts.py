@@ -1,22 +1,78 @@
-"""What a causal language model does with its hidden states on the way to logits: a factor times its head's.
+"""A causal language model taken apart: base, decoder layers, head, and the factor on its head's logits.
 
-Granite divides the logits by a constant and Cohere multiplies them; most do neither. Everything that makes
-logits here goes through `at_head`.
+    logits = factor * head(base(tokens))
+
+Granite divides the logits by a constant and Cohere multiplies them; for most models the factor is 1. It is
+measured once and kept at the head, where `generation.distribution.at_head` reads it.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    pass
-
+LAYER_NAMES = ("layers", "h", "blocks")
+WINDOWS = ("sliding_window", "attention_chunk_size")  # how far back a layer of a config may look
 FACTOR = "logit_factor"  # of a head that has been looked at
 SPAN = 100.0  # logits far beyond those of real models: a soft cap bends them
 TOLERANCE = 1e-3  # relative; the same operations twice, and one multiplication
+
+
+class Parts(NamedTuple):
+    """What a causal language model is made of: head(base(tokens)), times a factor kept at the head, are its
+    logits.
+    """
+
+    base: nn.Module
+    layers: nn.ModuleList
+    head: nn.Linear
+
+
+def parts(model: Any) -> Parts:
+    """The base transformer, its decoder layers and the language-model head.
+
+    Raises ValueError for an architecture in which they cannot be found, or whose logits are something else
+    than a factor times the head's output.
+    """
+    base, head = getattr(model, model.base_model_prefix, None), model.get_output_embeddings()
+    if base is not None and isinstance(head, nn.Linear):
+        for owner in (base, getattr(base, "decoder", None)):
+            for name in LAYER_NAMES:
+                layers = getattr(owner, name, None)
+                if isinstance(layers, nn.ModuleList):
+                    examine(model, base, head)
+                    return Parts(base, layers, head)
+    raise ValueError(
+        f"{type(model).__name__} is not a decoder-only model whose layers and head can be found. Llama, "
+        "Qwen, Mistral, GPT-2 and similar models are."
+    )
+
+
+def context_length(model: Any) -> int | None:
+    """How many positions the model knows; None where it does not say."""
+    for name in ("max_position_embeddings", "n_positions", "n_ctx"):
+        if (found := getattr(model.config, name, None)) is not None:
+            return int(found)
+    return None
+
+
+def attention_window(model: Any) -> int | None:
+    """How many tokens the narrowest layer looks back over; None: all of them."""
+    config = model.config.get_text_config()
+    if all(kind == "full_attention" for kind in getattr(config, "layer_types", None) or ["unknown"]):
+        return None
+    sizes = [size for name in WINDOWS if (size := getattr(config, name, None)) is not None]
+    return min(sizes, default=None)
+
+
+def parameter_counts(model: Any, trained: Iterable[nn.Parameter]) -> tuple[int, int]:
+    """How many numbers are trained, and how many there are, the model's and those trained beside it."""
+    trained = list(trained)
+    every = {id(parameter): parameter for parameter in (*model.parameters(), *trained)}
+    return sum(p.numel() for p in trained), sum(p.numel() for p in every.values())
 
 
 @torch.no_grad()

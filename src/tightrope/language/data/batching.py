@@ -1,4 +1,4 @@
-"""Several texts in one row of tokens, without any of them seeing another."""
+"""Rows of tokens as tensors: padded, grouped by length, or packed so that no text in a row sees another."""
 
 from __future__ import annotations
 
@@ -9,9 +9,80 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tightrope.language.data.examples import Example
-
 PADDING = -1  # the segment of padding in a packed row
+MOST_GROUPS = 4  # passes that a batch is split into at most
+PASS = 64  # what a pass costs besides its tokens, in tokens
+
+
+@dataclass(frozen=True)
+class Example:
+    """One text to learn from: ``learn[i]`` is True where token i is a target of the loss.
+
+    The first token never is: nothing before it could predict it.
+    """
+
+    tokens: tuple[int, ...]
+    learn: tuple[bool, ...]
+
+
+def positions(real: Tensor) -> Tensor:
+    """Position of every token [B, T]: real tokens count from 0, whatever the padding."""
+    return (real.long().cumsum(1) - 1).clamp(min=0)
+
+
+def pad_left(rows: Sequence[Sequence[int]], filler: int = 0) -> tuple[Tensor, Tensor]:
+    """Rows of ids as one [B, T] int64 that ends where they end, and its mask: True where a token is real."""
+    return _pad(rows, filler, left=True)
+
+
+def pad_right(rows: Sequence[Sequence[int]], filler: int = 0) -> tuple[Tensor, Tensor]:
+    """Rows of ids as one [B, T] int64 that begins where they begin, and its mask: True where a token is
+    real.
+    """
+    return _pad(rows, filler, left=False)
+
+
+def _pad(rows: Sequence[Sequence[int]], filler: int, *, left: bool) -> tuple[Tensor, Tensor]:
+    length = max((len(row) for row in rows), default=0)
+    tokens = torch.full((len(rows), length), filler, dtype=torch.int64)
+    real = torch.zeros(len(rows), length, dtype=torch.bool)
+    for i, row in enumerate(rows):
+        place = slice(length - len(row), length) if left else slice(len(row))
+        tokens[i, place] = torch.tensor(row, dtype=torch.int64)
+        real[i, place] = True
+    return tokens, real
+
+
+def length_groups(real: Tensor, mask: Tensor) -> list[Tensor]:
+    """Rows [B] of about one length each, in as many groups as make the padded passes cheapest.
+
+    A group costs its rows times the longest prompt and the longest response among them, and a pass PASS
+    tokens more, however small it is.
+    """
+    prompts = real[:, : real.shape[1] - mask.shape[1]].sum(1)
+    places = torch.arange(1, mask.shape[1] + 1, device=mask.device)
+    responses = torch.where(mask, places, 0).amax(1)
+    order = (prompts + responses).argsort(stable=True)
+    sizes = torch.stack([prompts, responses])[:, order].cpu()
+
+    def cost(groups: int) -> int:
+        parts = sizes.tensor_split(groups, dim=1)
+        return sum(part.shape[1] * int(part.amax(1).sum()) + PASS for part in parts)
+
+    fewest = min(range(1, min(MOST_GROUPS, len(mask)) + 1), key=cost)
+    return list(order.tensor_split(fewest))
+
+
+def used_columns(real: Tensor, mask: Tensor) -> tuple[int, int]:
+    """The columns [left, right) of [B, P + R] whose states matter: from the first real prompt token to the
+    token before the last counting one, in whose state that is chosen.
+    """
+    prompt = real.shape[1] - mask.shape[1]
+    any_prompt = real[:, :prompt].any(0).nonzero()
+    any_response = mask.any(0).nonzero()
+    left = int(any_prompt[0]) if len(any_prompt) else prompt - 1
+    right = prompt + (int(any_response[-1]) if len(any_response) else 0)
+    return left, right
 
 
 @dataclass(frozen=True)

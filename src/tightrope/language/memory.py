@@ -1,14 +1,19 @@
-"""The memory of a job, from shapes alone, before anything large is allocated.
+"""The memory of a job, from the shapes of its model alone, before anything large is allocated.
 
     peak = what stays + max(while responses are sampled and scored, while gradients are computed)
 
 What stays are the weights of the four roles, their gradients (kept until the next step) and Adam's moments.
 Not counted: Python and torch themselves, a GPU's context, and what the allocator keeps in hand (about a tenth
 on a CPU); `check` leaves room for them.
+
+The model is built on torch's meta device from its configuration. What a forward pass keeps for the backward
+pass is measured there too: torch shows every tensor that it saves, at three lengths, and the part that grows
+with the square of the length, which fused attention does not keep, is subtracted.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import os
 from collections.abc import Iterator
@@ -17,17 +22,18 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
+from torch import Tensor, nn
 
-from tightrope.language.generation.token_stats import CHUNK
-from tightrope.language.memory.sizes import Shapes, shapes_of
-from tightrope.language.model.load import fused
-from tightrope.language.model.reading import pretrained, without_weights
+from tightrope.language.generation.distribution import CHUNK
+from tightrope.language.model.load import fused, pretrained, without_weights
+from tightrope.language.model.parts import Parts, parts
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SupervisedSettings
 
 Phase = Literal["always", "rollout", "update"]
 SHARE = 0.9  # of the available memory that a job may claim
 FLOAT = 4  # bytes of a float32: adapters, heads, numbers per step
-LOGIT_COPIES = 6  # [chunk, vocabulary] at once in token_stats: p and log p of two models, gradients
+LENGTHS = (16, 32, 48)  # tokens at which a forward pass is measured, evenly spaced
+LOGIT_COPIES = 6  # [chunk, vocabulary] at once in token_statistics: p and log p of two models, gradients
 DRAW_BYTES = 28  # per row and word while a token is drawn: logits twice, log p; p and its sum in float64
 
 
@@ -173,15 +179,14 @@ def ledger(config: Any, job: Job) -> Ledger:
 def _roles(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
     """Weights, gradients and moments."""
     whole, head = shapes.item * shapes.parameters, FLOAT * (shapes.hidden + 1)
-    who = job.trained
     adapter = FLOAT * shapes.adapter(job.lora_rank, adapted)
-    yield Row(f"{who}: weights of the trunk", whole)
+    yield Row(f"{job.trained}: weights of the trunk", whole)
     if job.tune == "lora":
-        yield Row(f"{who}: weights of its adapter", adapter)
+        yield Row(f"{job.trained}: weights of its adapter", adapter)
     elif job.reference:
         yield Row("reference: a frozen copy", whole)
     learnt = whole if job.language_head else shapes.item * shapes.base
-    yield from _trained(who, learnt if job.tune == "full" else adapter)
+    yield from _trained(job.trained, learnt if job.tune == "full" else adapter)
     if job.critic != "none":
         own = {"head": 0, "adapter": adapter, "separate": shapes.item * shapes.base}[job.critic]
         role = "critic" if job.language_head else "score head"
@@ -192,21 +197,6 @@ def _roles(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
         yield Row("reward model: weights", head + own)
     for name, size in job.judges:
         yield Row(f"reward model {name}: weights", size)
-
-
-def reward_model_bytes(folder: Path) -> int:
-    """The weights of the reward model in this folder as `load_reward` loads them, in float32, from its own
-    config.json; 0 where there is none, which loading refuses.
-    """
-    from transformers import AutoConfig, AutoModel
-
-    path = folder / "model" if (folder / "model" / "config.json").is_file() else folder
-    if not (path / "config.json").is_file():
-        return 0
-    config = pretrained(AutoConfig, path)
-    with torch.device("meta"):
-        base = fused(without_weights, AutoModel, config)
-    return FLOAT * (sum(p.numel() for p in base.parameters()) + config.get_text_config().hidden_size)
 
 
 def _trained(role: str, size: int) -> Iterator[Row]:
@@ -279,7 +269,7 @@ def check(found: Ledger, available: int | None) -> None:
 
 
 def _alternatives(job: Job) -> Iterator[tuple[str, Job]]:
-    """Each way to need less alone, then all of them together."""
+    """Each way to need less by itself, then all of them together."""
     fewer, half = max(1, job.micro_batch_size // 4), max(1, job.batch_size // 2)
     ways: dict[str, dict[str, Any]] = {
         f"--micro-batch-size {fewer}": {"micro_batch_size": fewer},
@@ -295,6 +285,114 @@ def _alternatives(job: Job) -> Iterator[tuple[str, Job]]:
         together |= change
         yield words, dataclasses.replace(job, **change)
     yield "all of these", dataclasses.replace(job, **together)
+
+
+class Shapes(NamedTuple):
+    """Numbers of parameters, and bytes per token in one dtype.
+
+    ``parameters``: of the whole model, tied ones once; ``base``: without its own language-model head.
+    ``linears``: (outputs, inputs) of every linear layer of every decoder layer, in either order. ``cache``:
+    bytes of the KV cache per token; ``saved``: bytes per token that all layers keep for a backward pass;
+    ``item``: bytes of one number.
+    """
+
+    parameters: int
+    base: int
+    linears: list[list[tuple[int, int]]]
+    hidden: int
+    vocabulary: int
+    kv_cache: int
+    saved: int
+    item: int
+
+    def adapter(self, rank: int, layers: int) -> int:
+        """Parameters of an adapter of this rank on the topmost layers."""
+        return sum(rank * (a + b) for layer in self.linears[-layers:] for a, b in layer)
+
+
+def shapes_of(config: Any, dtype: str) -> Shapes:
+    """The shapes of a causal language model of this configuration (transformers' PretrainedConfig).
+
+    Allocates nothing large. ValueError when the architecture is not known.
+    """
+    from transformers import AutoModelForCausalLM
+
+    kind = getattr(torch, dtype)
+    with torch.device("meta"):
+        config = copy.deepcopy(config)  # transformers writes into it
+        model = fused(without_weights, AutoModelForCausalLM, config, dtype=kind).eval()
+    found = parts(model)
+    linears = [_linears(layer) for layer in found.layers]
+    inner = config.get_text_config()
+    heads = getattr(inner, "num_key_value_heads", None) or inner.num_attention_heads
+    width = getattr(inner, "head_dim", None) or inner.hidden_size // inner.num_attention_heads
+    return Shapes(
+        parameters=sum(p.numel() for p in model.parameters()),
+        base=sum(p.numel() for p in found.base.parameters()),
+        linears=linears,
+        hidden=found.head.weight.shape[1],
+        vocabulary=found.head.weight.shape[0],
+        kv_cache=2 * len(linears) * heads * width * kind.itemsize,
+        saved=_saved_per_token(found, linears, kind.itemsize),
+        item=kind.itemsize,
+    )
+
+
+def _linears(layer: nn.Module) -> list[tuple[int, int]]:
+    """The shapes of the weights that an adapter would be put on; GPT-2's Conv1D has [in, out]."""
+    kinds = [m for m in layer.modules() if isinstance(m, nn.Linear) or type(m).__name__ == "Conv1D"]
+    weights = [m.get_parameter("weight").shape for m in kinds]
+    return [(shape[0], shape[1]) for shape in weights]
+
+
+def _saved_per_token(found: Parts, linears: list[list[tuple[int, int]]], item: int) -> int:
+    """Bytes per token that the base keeps for a backward pass through all of its weights."""
+    try:
+        first, second, third = (saved_bytes(found.base, length) for length in LENGTHS)
+    except (RuntimeError, NotImplementedError, ValueError, TypeError, AttributeError, IndexError):
+        # layers that must look at numbers, as routed experts do, or a base that takes no mask of four axes
+        widest = max(side for layer in linears for pair in layer for side in pair)
+        return len(linears) * (12 * found.head.weight.shape[1] + 4 * widest) * item
+    step = LENGTHS[1] - LENGTHS[0]
+    square = (third - 2 * second + first) / (2 * step**2)
+    return int((second - first) / step - square * (LENGTHS[0] + LENGTHS[1]))
+
+
+def saved_bytes(base: nn.Module, length: int) -> int:
+    """Bytes of all tensors that the forward pass of one row saves, each once and weights left out."""
+    held: dict[int, Tensor] = {}
+    weights = {p.untyped_storage()._cdata for p in base.parameters()}
+    place = next(base.parameters()).device
+
+    def hold(x: Tensor) -> Tensor:
+        storage = x.untyped_storage()
+        if storage._cdata not in weights:
+            held[storage._cdata] = x  # kept alive, so that no other storage gets its number
+        return x
+
+    # with a mask of four axes transformers looks at no number of it, which on meta it could not
+    mask = torch.ones(1, 1, length, length, dtype=torch.bool, device=place).tril()
+    tokens = torch.zeros(1, length, dtype=torch.int64, device=place)
+    with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(hold, lambda x: x):
+        out = base(input_ids=tokens, attention_mask=mask, use_cache=False).last_hidden_state
+    size = sum(x.untyped_storage().nbytes() for x in held.values())
+    del out  # until here its graph holds what was saved
+    return size
+
+
+def reward_model_bytes(folder: Path) -> int:
+    """The weights of the reward model in this folder as `load_reward` loads them, in float32, from its own
+    config.json; 0 where there is none, which loading refuses.
+    """
+    from transformers import AutoConfig, AutoModel
+
+    path = folder / "model" if (folder / "model" / "config.json").is_file() else folder
+    if not (path / "config.json").is_file():
+        return 0
+    config = pretrained(AutoConfig, path)
+    with torch.device("meta"):
+        base = fused(without_weights, AutoModel, config)
+    return FLOAT * (sum(p.numel() for p in base.parameters()) + config.get_text_config().hidden_size)
 
 
 def available_memory(device: str | torch.device = "cpu", root: Path = Path("/")) -> int | None:

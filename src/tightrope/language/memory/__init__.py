@@ -1,1 +1,0 @@
-"""The memory of a job before it begins."""
