@@ -382,7 +382,7 @@ def warm(story: str) -> None:
     else:
         import gymnasium
 
-        import tightrope.control.engine.compiled.fused
+        import tightrope.control.engine.compiled_engine
         import tightrope.control.train  # noqa: F401
 
         gymnasium.make("CartPole-v1").close()

@@ -15,7 +15,7 @@ import numpy as np
 
 from tightrope.control.environments import tasks
 from tightrope.control.environments.masks import find_source
-from tightrope.control.evaluate import EVALUATION_SEED
+from tightrope.control.settings import EVALUATION_SEED
 
 MAX_FRAMES = 10_000
 DEFAULT_FPS = 30

@@ -9,6 +9,7 @@ from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSet
 from tightrope.settings.fields import of_update_rule, setting
 from tightrope.settings.values import Settings
 
+EVALUATION_SEED = 1_000_003  # far from training's seeds, which start at settings.seed
 Algorithm = Literal["ppo", "a2c", "reinforce"]
 ALGORITHM_SETTINGS: dict[str, type[UpdateSettings]] = {
     "ppo": PPOSettings,

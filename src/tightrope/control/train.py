@@ -10,10 +10,10 @@ from typing import Any
 
 from tightrope.control.agent import AGENTS, Agent
 from tightrope.control.environments.make import Environments
-from tightrope.control.evaluate import EVALUATION_SEED, evaluate_agent, evaluation_environments
+from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
 from tightrope.control.saving import name_again, rebuild
-from tightrope.control.settings import TrainSettings
+from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite

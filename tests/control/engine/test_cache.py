@@ -29,7 +29,7 @@ def memory():
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 before = memory()
-from tightrope.control.engine.compiled.fused import FusedEngine
+from tightrope.control.engine.compiled_engine import FusedEngine
 from tightrope.control.engine.compiled import infer
 needed = memory() - before
 import engine_cases
@@ -60,7 +60,7 @@ def start(caches):
 @pytest.fixture
 def warm(tmp_path):
     """A cache directory with a copy of all that is compiled."""
-    from tightrope.control.engine.compiled import fused  # noqa: F401  (compiles what is not there yet)
+    from tightrope.control.engine import compiled_engine  # noqa: F401  (compiles what is not there yet)
 
     folder = cache.cache_folder()
     if folder is None or cache.compilation_due():

@@ -9,7 +9,7 @@ import torch
 from engine_cases import difference, make, make_batch, numbers
 
 from tightrope.algorithms.optimise import NonFiniteError, SamplingMismatch
-from tightrope.control.engine.compiled.fused import FusedEngine
+from tightrope.control.engine.compiled_engine import FusedEngine
 
 
 def refuse(policy, optimiser, settings, batch, threads):
