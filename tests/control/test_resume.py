@@ -150,7 +150,7 @@ PHASES = {
     "evaluation": (train, "evaluate_agent", 2),
     "rollout": ("tightrope.control.environments.pool.EnvironmentPool", "receive", 55),
     "advantages": ("tightrope.control.agent", "to_batch", 4),
-    "minibatch": ("tightrope.algorithms.ppo", "check_first_ratios", 4),
+    "minibatch": ("tightrope.algorithms.descent", "check_first_ratios", 4),
     "statistics": ("tightrope.control.policy.normalise.Normalisers", "update", 5),
     "row": (Run, "record", 4),
     "episodes": (Run, "record_episodes", 4),

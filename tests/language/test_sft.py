@@ -12,7 +12,7 @@ import torch
 from language.test_data import chatml, random_examples
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
-from tightrope.algorithms.optimise import Brake, NonFiniteError
+from tightrope.algorithms.optimise import NonFiniteError, StepGuard
 from tightrope.language.data.batching import collate, pack, row_of
 from tightrope.language.data.examples import hold_out
 from tightrope.language.model import lora
@@ -107,7 +107,9 @@ def test_micro_batches_add_up_to_the_minibatch(size):
         model = tiny_llama()
         optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
         settings = settings_of(micro_batch_size=micro, max_grad_norm=None)
-        metrics = take_step(objective_of(model, rows), rows, optimiser, Brake(torch.device("cpu")), settings)
+        metrics = take_step(
+            objective_of(model, rows), rows, optimiser, StepGuard(torch.device("cpu")), settings
+        )
         found.append((metrics, [p.detach() for p in model.parameters()]))
     (whole, wanted), (split, weights) = found
     assert split == pytest.approx(whole, rel=1e-5)
@@ -126,7 +128,7 @@ def test_a_gradient_that_is_not_finite_stops_before_the_step():
     objective = dataclasses.replace(objective_of(model, rows), loss=loss)
     optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
     with pytest.raises(NonFiniteError, match="The loss is nan in this step"):
-        take_step(objective, rows, optimiser, Brake(torch.device("cpu")), settings_of())
+        take_step(objective, rows, optimiser, StepGuard(torch.device("cpu")), settings_of())
     assert all(torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
 
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from tightrope.algorithms.memory import Parts
 from tightrope.algorithms.nonfinite import explain_loss
-from tightrope.algorithms.optimise import Adam, Brake, Meter
+from tightrope.algorithms.optimise import Adam, Meter, StepGuard
 from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.checkpoint import understood
@@ -117,14 +117,14 @@ class SupervisedLearner:
         Raises NonFiniteError before a step with a NaN or an infinity in its gradient.
         """
         objective, total = self.objective, self.total
-        brake = Brake(self.parameters[0].device)
+        guard = StepGuard(self.parameters[0].device)
         batches = minibatches(objective.items, self.settings, self.rollbacks)
         for minibatch in islice(batches, self.step, None):
             now = dataclasses.replace(self.settings, **self.changes)
             rate = scheduled(now.learning_rate, now.learning_rate_schedule, self.step / total)
             self.optimiser.param_groups[0]["lr"] = rate
             memory = Parts(self.micro_batch_size)
-            metrics = take_step(objective, minibatch, self.optimiser, brake, now, memory)
+            metrics = take_step(objective, minibatch, self.optimiser, guard, now, memory)
             metrics |= {f"{objective.steps}/learning_rate": rate or 0.0, **memory.metrics()}
             self.step += 1
             self.micro_batch_size = memory.size
@@ -222,7 +222,7 @@ def take_step(
     objective: Objective,
     minibatch: Sequence[Any],
     optimiser: torch.optim.Optimizer,
-    brake: Brake,
+    guard: StepGuard,
     settings: SupervisedSettings,
     parts: Parts | None = None,
 ) -> dict[str, float]:
@@ -244,9 +244,9 @@ def take_step(
         return sums
 
     sums = parts.fitting(len(minibatch), gradient, optimiser)
-    brake.bad = brake.bad | ~torch.isfinite(sums["loss"])
-    brake.step(optimiser, settings.max_grad_norm, meter)
-    brake.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
+    guard.refuse(~torch.isfinite(sums["loss"]))
+    guard.step(optimiser, settings.max_grad_norm, meter)
+    guard.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
     metrics = {f"{objective.name}/{name}": float(x) / count for name, x in sums.items()}
     metrics[f"{objective.steps}/grad_norm"] = meter.means()["train/grad_norm"]
     return metrics
