@@ -379,14 +379,14 @@ def test_a_folder_that_is_not_empty_is_not_used(capsys: pytest.CaptureFixture[st
     from tightrope.runs.run import Run
 
     (tmp_path / "mine.txt").write_text("mine")
-    fake_training(lambda settings, run_dir, report: Run.create(run_dir, {}, "name"))
+    fake_training(lambda settings, run_dir, listeners: Run.create(run_dir, {}, "name"))
     code, _, err = run_main(capsys, "train", "CartPole-v1", "--run-dir", str(tmp_path))
     assert code == 2
     assert "not empty" in err
 
 
 def test_an_error_inside_other_code_keeps_its_traceback() -> None:
-    fake_training(lambda settings, run_dir, report: int("this is a bug, not a user's mistake"))
+    fake_training(lambda settings, run_dir, listeners: int("this is a bug, not a user's mistake"))
     with pytest.raises(ValueError, match="a bug"):
         main(["train", "CartPole-v1"])
 
@@ -531,7 +531,7 @@ def test_ctrl_c_says_how_to_go_on(capsys: pytest.CaptureFixture[str], tmp_path: 
 
 
 def test_ctrl_c_before_the_run(capsys: pytest.CaptureFixture[str]) -> None:
-    def stop(settings: Any, run_dir: Any, report: Any) -> None:
+    def stop(settings: Any, run_dir: Any, listeners: Any) -> None:
         raise KeyboardInterrupt
 
     fake_training(stop)

@@ -336,7 +336,7 @@ def test_resume_says_what_it_cannot_promise(tmp_path, monkeypatch):
     said: list[str] = []
     monkeypatch.setattr(np, "__version__", "0.1")
     train.resume(tmp_path / "run", listeners=[lambda event: said.append(str(event))])
-    told = [line for line in said if "begin anew" in line or "versions" in line or "->" in line]
+    told = [line for line in said if "begin new episodes" in line or "-> 0.1" in line]
     assert len(told) == 2, said
     assert "numpy" in told[0] and "-> 0.1 since the checkpoint" in told[0]
     assert "4 environments begin new episodes at step 200" in told[1]

@@ -12,7 +12,7 @@ from tightrope.algorithms import ppo
 from tightrope.algorithms.memory import OutOfMemory
 from tightrope.language.alignment.align import align
 from tightrope.language.alignment.experience import gather
-from tightrope.language.alignment.iteration import Trainer, hold_out
+from tightrope.language.alignment.iteration import Trainer, hold_out_prompts
 from tightrope.language.alignment.kl import KL_FORMS, AdaptiveKL
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.data.examples import Prompt
@@ -189,11 +189,11 @@ def test_whitening_leaves_the_reward_metrics_in_units_of_the_score(folder):
 
 def test_held_out_prompts_are_never_trained_on_not_even_twins():
     prompts = [Prompt((k % 9,), str(k), {}) for k in range(30)]
-    kept, held = hold_out(prompts, 2)
+    kept, held = hold_out_prompts(prompts, 2)
     assert len(held) == 2 and not {p.tokens for p in held} & {p.tokens for p in kept}
-    assert len(hold_out(prompts, 100)[1]) == 2  # a quarter of nine different ones
+    assert len(hold_out_prompts(prompts, 100)[1]) == 2  # a quarter of nine different ones
     with pytest.raises(ValueError, match="3 different prompts"):
-        hold_out(prompts[:3] * 4, 1)
+        hold_out_prompts(prompts[:3] * 4, 1)
 
 
 def test_the_settings_of_the_update_reach_the_update(folder, monkeypatch):
@@ -306,7 +306,7 @@ def test_memory_that_is_short_for_a_kept_pass_is_told_once(folder, monkeypatch):
     """From then on no pass is kept: the size says so, and lies in the checkpoint."""
     from tightrope.language.alignment import experience as collect
 
-    lines, looks, whole = [], [], collect._look
+    lines, looks, whole = [], [], collect._evaluate
 
     def short(*args):
         looks.append(torch.is_grad_enabled())
@@ -314,21 +314,21 @@ def test_memory_that_is_short_for_a_kept_pass_is_told_once(folder, monkeypatch):
             raise torch.OutOfMemoryError("CUDA")
         return whole(*args)
 
-    monkeypatch.setattr(collect, "_look", short)
+    monkeypatch.setattr(collect, "_evaluate", short)
     made = trainer(folder, minibatch_size=16, total_episodes=48)
-    made.report = lambda _, event: lines.append(event.get("text", ""))
+    made.listeners.add(lambda event: lines.append(getattr(event, "text", "")))
     assert len(list(made.iterate())) == 3 and looks == [True, False, False, False]
     assert made.micro_batch_size == 16 and sum("memory ran out" in line for line in lines) == 1
 
 
-def test_the_clock_of_a_run_leaves_evaluations_out(folder):
+def test_the_clock_of_a_run_leaves_evaluations_out(folder, tmp_path):
     def slow(completions, **_):
         time.sleep(0.3)
         return [0.0] * len(completions)
 
-    settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, total_episodes=8)
-    made = Trainer(settings, list("abcdefgh"), letters, slow, Listeners())
+    settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, total_episodes=4)
     begin = time.perf_counter()
-    metrics = next(made.iterate()).metrics
+    run = align(settings, prompts=list("abcdefgh"), reward=letters, gold=slow, run_dir=tmp_path / "run")
+    [metrics] = run.metrics
     assert "eval/gold" in metrics and metrics["time/seconds"] <= time.perf_counter() - begin - 0.3
     assert metrics["time/update_seconds"] < metrics["time/seconds"]

@@ -39,8 +39,8 @@ Loss = Callable[[Evaluation, Tensor, Batch], Terms]  # (evaluation, log_ratio [B
 class Descent:
     """The steps of one update, and its metrics.
 
-    ``clip`` and ``clip_high``: beyond these a ratio counts as clipped in the metrics. The last three are those
-    of ``update``.
+    ``clip`` and ``clip_high``: beyond these a ratio counts as clipped in the metrics. The last three
+    arguments are those of ``update``.
     """
 
     def __init__(
