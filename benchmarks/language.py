@@ -113,7 +113,7 @@ def compare(
     name: str, layouts: list[str], peer_python: str | None, pairs: int, rewards: Path
 ) -> list[dict[str, Any]]:
     """The layouts of one model beside the peer: in every pair the peer runs once, each layout once."""
-    from tightrope.language.models import find_model
+    from tightrope.language.model.packaged import find_model
 
     shape, folder = MODELS[name], find_model(name)
     job = {"folder": folder, "batch": shape["batch"], "tokens": TOKENS, "threads": 2}

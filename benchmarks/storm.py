@@ -51,9 +51,9 @@ def control(env: str, **values: Any) -> Callable[[Path, Any], None]:
         from tightrope.control.train import resume, train
 
         if (folder / "settings.json").exists():
-            resume(folder, report=report)
+            resume(folder, listeners=[report])
         else:
-            train(resolve(env, "ppo", {**common, **values}), run_dir=folder, report=report)
+            train(resolve(env, "ppo", {**common, **values}), run_dir=folder, listeners=[report])
 
     return run
 
@@ -65,10 +65,10 @@ def letters(prompts: list[str], completions: list[str], **columns: Any) -> list[
 
 def language(folder: Path, report: Any) -> None:
     """PPO on a random Llama of two layers: value head, reference, KL controller, shuffled prompts."""
-    from tightrope.language.alignment import align, resume_align
+    from tightrope.language.alignment.align import align, resume_align
 
     prompts = ["".join(random.Random(k).choices("abcdefghijklmnop", k=1 + k % 5)) for k in range(11)]
-    given = {"prompts": prompts, "reward": letters, "report": report}
+    given = {"prompts": prompts, "reward": letters, "listeners": [report]}
     if (folder / "settings.json").exists():
         resume_align(folder, **given)
         return
@@ -154,9 +154,11 @@ def _live(story: str, folder: Path, slow: bool, out: int) -> int:
     def tell(what: str, step: int) -> None:
         os.write(out, f"{what} {step}\n".encode())
 
-    def report(event: str, data: dict[str, Any]) -> None:
-        if event in ("start", "update"):
-            tell(event, int(data["step"]))
+    def report(event: Any) -> None:
+        from tightrope.training.events import Started, Updated
+
+        if isinstance(event, Started | Updated):
+            tell("start" if isinstance(event, Started) else "update", event.step)
 
     save, sync = checkpoint.save, os.fsync
 
@@ -299,8 +301,8 @@ def compare(story: str, wanted: dict[str, Any], found: dict[str, Any]) -> None:
 def cost(base: Path, steps: int) -> dict[str, Any]:
     """Seconds of a grid point of CartPole-v1 at default settings: save, sync, and environments anew."""
     from tightrope.control import train
-    from tightrope.control.collect import Collector
     from tightrope.control.resolve import resolve
+    from tightrope.control.rollout.collector import Collector
 
     spent = {"save": [], "reset": []}
 
@@ -374,13 +376,13 @@ def warm(story: str) -> None:
     if story == "language":
         import transformers
 
-        import tightrope.language.alignment
+        import tightrope.language.alignment.align
 
         transformers.utils.logging.disable_progress_bar()
     else:
         import gymnasium
 
-        import tightrope.control.engine.fused
+        import tightrope.control.engine.compiled_engine
         import tightrope.control.train  # noqa: F401
 
         gymnasium.make("CartPole-v1").close()

@@ -199,15 +199,16 @@ def language() -> Tracer:
     import transformers
 
     from tightrope.language import align
+    from tightrope.training.events import Event, Started
 
     def reward(prompts: list[str], completions: list[str], **columns: Any) -> list[float]:
         return [float(len(text)) for text in completions]
 
     started = []
 
-    def report(event: str, data: dict[str, Any]) -> None:
-        if event == "start":
-            started.append(data)
+    def listen(event: Event) -> None:
+        if isinstance(event, Started):
+            started.append(event)
 
     def update() -> None:
         started.clear()
@@ -216,7 +217,7 @@ def language() -> Tracer:
             align(
                 model="glassllm", prompts=["the film was"], reward=reward, total_episodes=1, batch_size=1,
                 minibatch_size=1, num_epochs=1, max_new_tokens=2, critic="head", reward_timeout=None, seed=1,
-                threads=1, checkpoint_every=None, run_dir=Path(folder) / "run", report=report,
+                threads=1, checkpoint_every=None, run_dir=Path(folder) / "run", listeners=[listen],
             )  # fmt: skip
 
     def prompt_enters(frame: FrameType) -> bool:

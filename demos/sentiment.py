@@ -171,40 +171,39 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
 
 
 def _display(columns: Any, what: str) -> Any:
-    from tightrope import panel
-    from tightrope.language.display import Display
+    from tightrope.cli.display import Display, can_live
 
-    return Display(columns, what, sys.stdout, live=panel.can_live(sys.stdout, dict(os.environ)))
+    return Display(columns, what, sys.stdout, live=can_live(sys.stdout, dict(os.environ)))
 
 
 def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, Any]) -> str:
     """Stage one: what a review sounds like."""
     if not (out / "sft" / "summary.json").exists():
-        from tightrope.language.display import SFT
+        from tightrope.cli.display import SFT
         from tightrope.language.settings import SFTSettings
-        from tightrope.language.sft import train_sft
+        from tightrope.language.supervised.sft import train_sft
 
         print("\n1. Supervised fine-tuning: the language of film reviews")
         rng = random.Random(4)
         texts = [{"text": window(text, 26, ENDS[model], rng)} for text, _ in rows for _ in range(3)]
         settings = SFTSettings(model=model, data="film reviews", seed=0, **values)
         with _display(SFT, "steps") as display:
-            train_sft(settings, data=texts, run_dir=out / "sft", report=display)
+            train_sft(settings, data=texts, run_dir=out / "sft", listeners=[display])
     return str(out / "sft" / "model")
 
 
 def _reward(out: Path, model: str, rows: list[tuple[str, int]], ends: float, values: dict[str, Any]) -> str:
     """Stage two: which of two texts is the better one."""
     if not (out / "reward" / "summary.json").exists():
-        from tightrope.language.display import REWARD
-        from tightrope.language.reward_model import train_reward
+        from tightrope.cli.display import REWARD
         from tightrope.language.settings import RewardSettings
+        from tightrope.language.supervised.preferences import train_reward
 
         print("\n2. Reward model: a stretch of praise is preferred to one of blame")
         settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **values)
         data = pairs(rows, 24, ends, values["max_examples"])
         with _display(REWARD, "steps") as display:
-            train_reward(settings, data=data, run_dir=out / "reward", report=display)
+            train_reward(settings, data=data, run_dir=out / "reward", listeners=[display])
     return str(out / "reward")
 
 
@@ -212,32 +211,32 @@ def _align(
     values: dict[str, Any], model: str, reward: str, gold: Any, out: Path, prompts: list[str]
 ) -> tuple[Any, float, list[dict[str, Any]]]:
     """Stage three: PPO. Also returns the warnings it gave, and after how many responses."""
-    from tightrope.language.alignment import align
-    from tightrope.language.display import ALIGN
+    from tightrope.cli.display import ALIGN
+    from tightrope.language.alignment.align import align
+    from tightrope.training.events import Event, Message
 
     print("\n3. PPO towards what the reward model prefers, held near the reference by the KL")
     begin, alarms, step = time.perf_counter(), list[dict[str, Any]](), 0
 
     with _display(ALIGN, "responses") as display:
 
-        def report(event: str, data: dict[str, Any]) -> None:
+        def listen(event: Event) -> None:
             nonlocal step
-            step = data.get("step", step)
-            if data.get("warning"):
-                alarms.append({"after": step, "text": data["text"]})
-            display(event, data)
+            step = getattr(event, "step", step)
+            if isinstance(event, Message) and event.level == "warning":
+                alarms.append({"after": step, "text": event.text})
 
         run = align(model=model, prompts=prompts, reward=reward, gold=gold, run_dir=out / "align",
-                    report=report, **values)  # fmt: skip
+                    listeners=[listen, display], **values)  # fmt: skip
     return run, time.perf_counter() - begin, alarms
 
 
 def _summary(
     options: Any, run: Any, seconds: float, alarms: list[dict[str, Any]], gold: Any, prompts: list[str]
 ) -> dict[str, Any]:
-    from tightrope import panel
-    from tightrope.language.evaluate import sample_run
-    from tightrope.language.samples import print_comparison
+    from tightrope.cli import display
+    from tightrope.language.alignment.samples import print_comparison
+    from tightrope.language.compare import sample_run
 
     names = ("objective/scores", "objective/kl", "eval/gold", "objective/distinct_2")
     curve = [{"episodes": row["step"], **{name: row.get(name) for name in names}} for row in run.metrics]
@@ -245,7 +244,7 @@ def _summary(
         ("reward", "objective/scores"),
         ("KL to the reference, nats a response", "objective/kl"),
     ):
-        print(f"\n{title}", *panel.curve([(row["episodes"], row[name]) for row in curve]), sep="\n")
+        print(f"\n{title}", *display.curve([(row["episodes"], row[name]) for row in curve]), sep="\n")
     compared = sample_run(run.path, prompts, seed=99)
     before, after = (
         gold([row["prompt"] for row in compared], [row[which] for row in compared])

@@ -10,12 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tightrope.algorithms.settings import range_text
+from tightrope.cli.flags import settings_fields
 from tightrope.control.presets import BY_TASK
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
-from tightrope.flags import settings_fields
-from tightrope.runs.declare import Metric
-from tightrope.runs.metrics import FAMILIES, of_story
+from tightrope.metrics.declare import Metric
+from tightrope.metrics.table import FAMILIES, of_story
+from tightrope.settings.fields import range_text
 
 PAGE = Path(__file__).with_name("control.md")
 

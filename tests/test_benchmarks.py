@@ -94,11 +94,11 @@ def test_shares_add_up():
 
 def test_flags_are_those_of_the_command_line():
     """What speed.py says on the command line is read back as the settings it means."""
-    from tightrope.options import overrides, train_options
+    from tightrope.cli.options import training_options
 
     wanted = report.tightrope_settings(SMALL) | {"total_steps": 2048}
-    env, values = overrides(*train_options(["CartPole-v1", *report.flags(wanted)]))
-    assert env == "CartPole-v1"
+    _, values = training_options("train", ["CartPole-v1", *report.flags(wanted)])
+    assert values["env"] == "CartPole-v1"
     assert {name: values[name] for name in wanted} == wanted
 
 

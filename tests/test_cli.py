@@ -16,27 +16,24 @@ from typing import Any
 
 import pytest
 
-from tightrope import cli, flags, options, panel
-from tightrope.algorithms.settings import range_text
-from tightrope.control.settings import (
-    ALGORITHM_SETTINGS,
-    TrainSettings,
-    settings_from_json,
-    settings_to_json,
-    values_from_json,
-)
+from tightrope.cli import display, flags, options
+from tightrope.cli.main import main
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+from tightrope.settings.fields import range_text
+from tightrope.training.events import Evaluated, Finished, Listeners, Started, Updated
 
 ALGORITHMS = list(ALGORITHM_SETTINGS)
 
 
 def run_main(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    code = cli.main(list(words))
+    code = main(list(words))
     captured = capsys.readouterr()
     return code, captured.out, captured.err
 
 
 def resolved(*words: str) -> tuple[str, dict[str, Any]]:
-    return options.overrides(*options.train_options(list(words)))
+    _, values = options.training_options("train", list(words))
+    return values.pop("env"), values
 
 
 # ---------------------------------------------------------------------------- the flags
@@ -44,7 +41,7 @@ def resolved(*words: str) -> tuple[str, dict[str, Any]]:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_setting_is_a_flag_with_doc_range_and_default(algorithm: str) -> None:
-    parser = options.train_parser(algorithm)
+    parser = options.training_parser("train", algorithm)
     text = " ".join(parser.format_help().split())
     known = parser.flags()
     for kind in (TrainSettings, ALGORITHM_SETTINGS[algorithm]):
@@ -64,13 +61,13 @@ def test_every_setting_is_a_flag_with_doc_range_and_default(algorithm: str) -> N
 )
 def test_every_option_has_help_and_fits_100_columns(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    parser = options.train_parser(make) if isinstance(make, str) else make()
+    parser = options.training_parser("train", make) if isinstance(make, str) else make()
     assert all(action.help for action in parser._actions)
     assert max(map(len, parser.format_help().splitlines())) <= 100
 
 
 def test_every_setting_stands_in_a_named_group() -> None:
-    assert "more" not in options.train_parser().format_help().split("\n\n")
+    assert "more" not in options.training_parser("train").format_help().split("\n\n")
     listed = [name for names in options.GROUPS.values() for name in names]
     assert sorted(listed) == sorted(flags.settings_fields(TrainSettings))
 
@@ -104,7 +101,7 @@ def test_flags_say_every_setting_and_return_it(algorithm: str, changed: bool) ->
         else {}
     )
     settings = TrainSettings().with_values(algorithm=algorithm, **values)
-    data = settings_to_json(settings)
+    data = settings.to_json()
     words = as_words(TrainSettings, data) + as_words(ALGORITHM_SETTINGS[algorithm], data["update"])
     env, said = resolved("Task-v0", *words)
     assert env == "Task-v0"
@@ -116,7 +113,7 @@ def test_a_settings_file_runs_again_and_flags_win(tmp_path: Path, algorithm: str
     settings = TrainSettings(env="Task-v0").with_values(
         algorithm=algorithm, gamma=0.9, hidden=(8, 8), num_workers=3
     )
-    (tmp_path / "settings.json").write_text(json.dumps(settings_to_json(settings)))
+    (tmp_path / "settings.json").write_text(json.dumps(settings.to_json()))
     for path in (tmp_path, tmp_path / "settings.json"):
         env, values = resolved("--settings", str(path))
         assert TrainSettings(env=env).with_values(**values) == settings
@@ -126,7 +123,7 @@ def test_a_settings_file_runs_again_and_flags_win(tmp_path: Path, algorithm: str
 
 
 def test_another_update_rule_leaves_the_files_own_settings(tmp_path: Path) -> None:
-    data = settings_to_json(TrainSettings().with_values(clip=0.1, gamma=0.9, num_envs=4))
+    data = TrainSettings().with_values(clip=0.1, gamma=0.9, num_envs=4).to_json()
     (tmp_path / "settings.json").write_text(json.dumps(data))
     _, values = resolved("--settings", str(tmp_path), "--algorithm", "a2c")
     assert values["algorithm"] == "a2c"
@@ -148,9 +145,9 @@ def test_only_what_is_given_overrides_the_preset() -> None:
 def test_dry_run_prints_the_settings_and_stops(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     os.chdir(tmp_path)
     code, out, _ = run_main(capsys, "train", "CartPole-v1", "--dry-run", "--clip", "0.1", "--seed", "5")
-    settings = settings_from_json(json.loads(out))
+    settings = TrainSettings.from_json(json.loads(out))
     assert (code, settings.env, settings.seed) == (0, "CartPole-v1", 5)
-    assert settings_to_json(settings)["update"]["clip"] == 0.1
+    assert settings.to_json()["update"]["clip"] == 0.1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -185,7 +182,7 @@ def test_the_settings_of_another_command_are_refused(
         for other in {"sft", "reward", "align"} - {command}:
             code, _, err = run_main(capsys, other, "--settings", str(tmp_path), "--dry-run")
             assert code == 2 and f"the settings of {command}, expected those of {other}" in err
-    (tmp_path / "settings.json").write_text(json.dumps(settings_to_json(TrainSettings())))
+    (tmp_path / "settings.json").write_text(json.dumps(TrainSettings().to_json()))
     code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
     assert code == 2 and "the settings of train" in err
 
@@ -216,9 +213,9 @@ def test_what_was_an_object_or_code_is_named_again(
 def test_a_language_settings_file_is_checked(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for values, message in (
         ({"batch_sise": 3}, "Did you mean 'batch_size'"),
-        ({"batch_size": "8"}, "batch_size is '8'; expected int"),
+        ({"batch_size": "8"}, "batch_size is '8' (str); expected int"),
         ({"update": 3}, "update is 3"),
-        ([], "holds list"),
+        ([], "the settings are list"),
     ):
         (tmp_path / "settings.json").write_text(json.dumps(values))
         code, _, err = run_main(capsys, "align", "--settings", str(tmp_path), "--dry-run")
@@ -232,9 +229,7 @@ def test_a_flag_that_gathers_may_be_repeated() -> None:
 
 
 def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
-    from tightrope.cli_language import _align_parser
-
-    text = " ".join(_align_parser().format_help().split())
+    text = " ".join(options.training_parser("align").format_help().split())
     assert "without its normalisation of rewards" in text
     assert "without its language-modelling loss on correct responses" in text
     ziegler = shown(capsys, "align", "--recipe", "ziegler2019")
@@ -253,7 +248,7 @@ def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> 
         ({"num_env": 3}, "Did you mean 'num_envs'"),
         ({"update": {"clipp": 3}}, "Did you mean 'clip'"),
         ({"algorithm": "a2c", "update": {"clip": 0.2}}, "A2CSettings has no setting named 'clip'"),
-        ({"num_envs": "8"}, "num_envs is '8'; expected int"),
+        ({"num_envs": "8"}, "num_envs is '8' .str.; expected int"),
         ({"num_envs": 8.0}, "expected int"),
         ({"num_envs": True}, "expected int"),
         ({"num_envs": None}, "expected int"),
@@ -261,17 +256,17 @@ def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> 
         ({"hidden": [64, "64"]}, "whole numbers"),
         ({"hidden": 64}, "whole numbers"),
         ({"update": {"gamma": "0.9"}}, "expected float"),
-        ({"update": {"target_kl": False}}, "expected float or null"),
+        ({"update": {"target_kl": False}}, "expected float or None"),
         ({"update": {"gamma": 1.5}}, "gamma is 1.5"),
     ],
 )
 def test_a_settings_file_is_checked(data: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        settings_from_json(data)
+        TrainSettings.from_json(data)
 
 
 def test_numbers_without_a_point_are_floats_where_floats_are_due() -> None:
-    values = values_from_json({"update": {"gamma": 1}})
+    values = TrainSettings.values_from_json({"update": {"gamma": 1}})
     assert type(values["gamma"]) is float
 
 
@@ -329,7 +324,7 @@ def test_a_wrong_flag_is_answered_with_the_right_one(
 
 
 def test_every_peer_name_leads_to_a_real_flag() -> None:
-    known = {flag for algorithm in ALGORITHMS for flag in options.train_parser(algorithm).flags()}
+    known = {flag for algorithm in ALGORITHMS for flag in options.training_parser("train", algorithm).flags()}
     for name, meant in flags.PEER_NAMES.items():
         assert meant.replace("_", "-").split()[0] in known
         assert name.replace("_", "-") not in known
@@ -384,20 +379,20 @@ def test_a_folder_that_is_not_empty_is_not_used(capsys: pytest.CaptureFixture[st
     from tightrope.runs.run import Run
 
     (tmp_path / "mine.txt").write_text("mine")
-    fake_training(lambda settings, run_dir, report: Run.create(run_dir, {}, "name"))
+    fake_training(lambda settings, run_dir, listeners: Run.create(run_dir, {}, "name"))
     code, _, err = run_main(capsys, "train", "CartPole-v1", "--run-dir", str(tmp_path))
     assert code == 2
     assert "not empty" in err
 
 
 def test_an_error_inside_other_code_keeps_its_traceback() -> None:
-    fake_training(lambda settings, run_dir, report: int("this is a bug, not a user's mistake"))
+    fake_training(lambda settings, run_dir, listeners: int("this is a bug, not a user's mistake"))
     with pytest.raises(ValueError, match="a bug"):
-        cli.main(["train", "CartPole-v1"])
+        main(["train", "CartPole-v1"])
 
 
 def test_a_file_never_names_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    data = settings_to_json(TrainSettings(env="evil_module:Task-v0"))
+    data = TrainSettings(env="evil_module:Task-v0").to_json()
     (tmp_path / "settings.json").write_text(json.dumps(data))
     code, _, err = run_main(capsys, "train", "--settings", str(tmp_path))
     assert code == 2
@@ -458,25 +453,22 @@ def a_run(folder: Path, stop_at: int | None = None) -> Any:
     """A training function that reports 100 updates as the real one does, without learning anything."""
     from tightrope.runs.run import Run
 
-    def train(settings: TrainSettings, run_dir: str | None, report: Any) -> dict[str, Any]:
-        with Run.create(folder / "run", settings_to_json(settings), "name") as run:
-            report("line", {"text": "clip is high", "warning": True})
-            where = {"run_dir": str(run.path), "step": 0, "total_steps": 1000}
-            report("start", {"settings": SETTINGS, **where, "lines": ["engine: fused"]})
+    def train(settings: TrainSettings, run_dir: str | None, listeners: Any) -> dict[str, Any]:
+        report = Listeners(listeners)
+        with Run.create(folder / "run", settings.to_json(), "name") as run:
+            report.warn("clip is high")
+            report(Started(str(run.path), SETTINGS, 0, 1000, ("engine: fused",)))
             for update in range(1, 101):
                 values = {"rollout/ep_rew_mean": float(update), "train/approx_kl": 0.01, "time/fps": 5000.0}
                 values |= {"rollout/ep_len_mean": 20.0, "train/clip_fraction": 0.1}
                 run.record(10 * update, update / 50, values)
-                data = {"step": 10 * update, "total_steps": 1000, "metrics": values, "seconds": update / 50}
-                report("update", data)
+                report(Updated(10 * update, 1000, update / 50, values))
                 if update % 20 == 0:
-                    report(
-                        "evaluation", {"step": 10 * update, "eval/mean_reward": 3.0, "eval/std_reward": 1.0}
-                    )
+                    report(Evaluated(10 * update, {"eval/mean_reward": 3.0, "eval/std_reward": 1.0}))
                 if update == stop_at:
                     raise KeyboardInterrupt
             run.finish(SUMMARY)
-        report("finish", SUMMARY)
+        report(Finished(SUMMARY))
         return SUMMARY
 
     return train
@@ -539,7 +531,7 @@ def test_ctrl_c_says_how_to_go_on(capsys: pytest.CaptureFixture[str], tmp_path: 
 
 
 def test_ctrl_c_before_the_run(capsys: pytest.CaptureFixture[str]) -> None:
-    def stop(settings: Any, run_dir: Any, report: Any) -> None:
+    def stop(settings: Any, run_dir: Any, listeners: Any) -> None:
         raise KeyboardInterrupt
 
     fake_training(stop)
@@ -572,7 +564,7 @@ def test_evaluate_passes_what_is_given_and_prints_the_interval(capsys: pytest.Ca
 def test_help_is_quick_and_needs_no_heavy_package(words: list[str]) -> None:
     heavy = "torch numba gymnasium numpy rich safetensors"
     code = (
-        "import sys\nfrom tightrope.cli import main\ntry:\n    code = main(sys.argv[1:])\n"
+        "import sys\nfrom tightrope.cli.main import main\ntry:\n    code = main(sys.argv[1:])\n"
         "except SystemExit as end:\n    code = end.code\n"
         f"print('heavy:', [m for m in '{heavy}'.split() if m in sys.modules])\nsys.exit(code)"
     )
@@ -606,10 +598,10 @@ def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) 
             return True
 
     stream = Terminal()
-    report = panel.choose(stream, quiet=False, live=True)
+    report = display.choose(stream, quiet=False, live=True)
     begin = time.monotonic()
     with report:
-        a_run(tmp_path)(TrainSettings(), None, report)
+        a_run(tmp_path)(TrainSettings(), None, [report])
     paints = stream.getvalue().count("CartPole-v1")
     assert 2 <= paints <= 4 + 4 * (time.monotonic() - begin)
     last = stream.getvalue().rpartition("CartPole-v1")[2]
@@ -629,29 +621,29 @@ def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) 
 @pytest.mark.parametrize("environment", [{"NO_COLOR": "1"}, {"TERM": "dumb"}, {"CI": "true"}])
 def test_no_panel_where_it_is_not_wanted(environment: dict[str, str]) -> None:
     terminal = types.SimpleNamespace(isatty=lambda: True)
-    assert panel.can_live(terminal, {"TERM": "xterm"})  # type: ignore[arg-type]
-    assert not panel.can_live(terminal, environment)  # type: ignore[arg-type]
-    assert not panel.can_live(types.SimpleNamespace(isatty=lambda: False), {})  # type: ignore[arg-type]
+    assert display.can_live(terminal, {"TERM": "xterm"})  # type: ignore[arg-type]
+    assert not display.can_live(terminal, environment)  # type: ignore[arg-type]
+    assert not display.can_live(types.SimpleNamespace(isatty=lambda: False), {})  # type: ignore[arg-type]
 
 
 def test_curves_rise_with_their_values() -> None:
-    assert panel.sparkline([1, 2, 3, 4, 5, 6, 7, 8], 8) == panel.BARS
-    assert panel.sparkline([5.0, 5.0], 8) == "▁▁"
-    assert panel.sparkline([], 8) == ""
-    assert len(panel.sparkline(list(range(1000)), 30)) == 30
-    lines = panel.curve([(10 * k, float(k)) for k in range(200)], width=40, height=4)
+    assert display.sparkline([1, 2, 3, 4, 5, 6, 7, 8], 8) == display.BARS
+    assert display.sparkline([5.0, 5.0], 8) == "▁▁"
+    assert display.sparkline([], 8) == ""
+    assert len(display.sparkline(list(range(1000)), 30)) == 30
+    lines = display.curve([(10 * k, float(k)) for k in range(200)], width=40, height=4)
     assert len(lines) == 5
     filled = [sum(not c.isspace() for c in line.partition("│")[2]) for line in lines[:4]]
     assert filled == sorted(filled)
     assert filled[-1] >= 39
     assert lines[-1].split() == ["0", "1,990", "steps"]
-    assert panel.curve([(1, 1.0)]) == []
-    assert len(panel.curve([(1, 5.0), (2, 5.0)])) == 9
-    assert panel.curve([(1, float("nan")), (2, 1.0)]) == []
+    assert display.curve([(1, 1.0)]) == []
+    assert len(display.curve([(1, 5.0), (2, 5.0)])) == 9
+    assert display.curve([(1, float("nan")), (2, 1.0)]) == []
 
 
 def test_figures_are_short() -> None:
-    assert [panel.number(x) for x in (1234.56, 12.25, 0.01234, 0.0, None, float("nan"))] == [
+    assert [display.number(x) for x in (1234.56, 12.25, 0.01234, 0.0, None, float("nan"))] == [
         "1,234.6",
         "12.25",
         "0.0123",
@@ -659,7 +651,7 @@ def test_figures_are_short() -> None:
         "-",
         "-",
     ]
-    assert [panel.clock(x) for x in (7, 67.4, 3725, float("nan"))] == ["0:07", "1:07", "1:02:05", "-"]
+    assert [display.clock(x) for x in (7, 67.4, 3725, float("nan"))] == ["0:07", "1:07", "1:02:05", "-"]
 
 
 def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
@@ -669,9 +661,9 @@ def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
         def write(self, text: str) -> int:
             raise BrokenPipeError
 
-    report = panel.choose(Gone(), quiet=False, live=False)
+    report = display.choose(Gone(), quiet=False, live=False)
     with report:
-        summary = a_run(tmp_path)(TrainSettings(), None, report)
+        summary = a_run(tmp_path)(TrainSettings(), None, [report])
     assert summary == SUMMARY
     assert report.step == 1000
 
@@ -679,8 +671,8 @@ def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
 def test_time_left_counts_this_runs_steps_only(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    progress = panel.Progress()
-    progress.take("start", {"settings": SETTINGS, "run_dir": "run", "step": 400, "total_steps": 1000})
+    progress = display.Position()
+    progress.take(Started("run", SETTINGS, 400, 1000, ()))
     now[0] += 10.0
-    progress.take("update", {"step": 600, "total_steps": 1000, "metrics": {}, "seconds": 1.0})
+    progress.take(Updated(600, 1000, 1.0, {}))
     assert progress.seconds_left() == pytest.approx(20.0)

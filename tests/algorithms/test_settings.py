@@ -4,7 +4,8 @@ import dataclasses
 
 import pytest
 
-from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings, scheduled
+from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings
+from tightrope.settings.fields import scheduled
 
 
 @pytest.mark.parametrize("kind", [PPOSettings, A2CSettings, ReinforceSettings])

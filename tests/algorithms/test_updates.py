@@ -199,7 +199,7 @@ def test_a_nan_gradient_takes_no_step_and_says_so():
         assert distance(model, TinyModel()) == 0
 
 
-def test_the_fused_adam_skips_a_braked_step_by_itself():
+def test_the_fused_adam_skips_a_refused_step_by_itself():
     """What an accelerator relies on: found_inf leaves weights and moments as they are."""
     parameter = torch.nn.Parameter(torch.ones(3))
     optimiser = torch.optim.Adam([parameter], fused=True)

@@ -149,7 +149,7 @@ def attacks() -> list[Attack]:
 def play(place: Path) -> dict[str, Any]:
     """Every attack on every command; outcomes by attack and command."""
     import tightrope
-    from tightrope.cli import main
+    from tightrope.cli.main import main
 
     small = [
         "--total-steps",

@@ -157,8 +157,8 @@ def of_runs() -> list[Attack]:
         Attack("rewards in a list", edit("settings.json", reward=[code]), "reward is"),
         Attack("gold names code", both(file, edit("settings.json", gold=code)), f"--gold {code}"),
         Attack("gold is a lambda", edit("settings.json", gold="<lambda>"), "--gold FILE.py:function"),
-        Attack("unknown setting", edit("settings.json", _target_=code), "no setting named _target_"),
-        Attack("update is text", edit("settings.json", update=code), "not the settings of an alignment run"),
+        Attack("unknown setting", edit("settings.json", _target_=code), "no setting named '_target_'"),
+        Attack("update is text", edit("settings.json", update=code), "expected an object with the settings"),
         Attack("prompts name code", both(file, edit("settings.json", data=f"{MARK}.py")), "ends with '.py'"),
         Attack("ptx names code", edit("settings.json", ptx_data=f"{MARK}.py:x", ptx_weight=1.0), MARK),
         Attack("model names nothing", edit("settings.json", model=f"../{MARK}.py"), "There is no model"),
@@ -203,7 +203,7 @@ def of_supervised() -> list[Attack]:
 
 def cases(place: Path) -> Iterator[tuple[str, str, Path, Attack, Callable[[Path], Any]]]:
     """Group, command, good folder, attack and call for everything there is to play."""
-    from tightrope.cli import main
+    from tightrope.cli.main import main
 
     model, prompts, chats = (str(place / name) for name in ("model", "prompts.jsonl", "chats.jsonl"))
 
@@ -245,7 +245,7 @@ def cases(place: Path) -> Iterator[tuple[str, str, Path, Attack, Callable[[Path]
 
 def prepare(place: Path) -> None:
     """A tiny model, a run of each stage, and data."""
-    from tightrope.cli import main
+    from tightrope.cli.main import main
 
     saved(place / "model", tiny_llama(1), chat=True)
     rows = [{"prompt": text} for text in ("ab", "cd", "efg", "hi")]

@@ -47,7 +47,7 @@ def run(*words: Any) -> dict[str, Any]:
     WATCH.allowed = tuple(text.partition(":")[0] for text in texts if ".py" in text)
 
     def command() -> int:
-        from tightrope.cli import main  # heard, too
+        from tightrope.cli.main import main  # heard, too
 
         return main(texts)
 
@@ -90,7 +90,7 @@ def spawned() -> dict[str, Any]:
         "resume unnamed": run("resume", own, "--total-steps", "768", "--quiet"),
     }
     context = multiprocessing.get_context("spawn")
-    with mock.patch("tightrope.control.copies.start_context", lambda: context):
+    with mock.patch("tightrope.control.environments.pool.start_context", lambda: context):
         found["train"] = run(
             "train", "CartPole-v1", "--run-dir", life, "--total-steps", "256", *SMALL, *WORKERS,
             "--engine", "torch",

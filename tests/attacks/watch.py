@@ -30,7 +30,8 @@ MARK = "attackmark"
 TEMPLATE = "<template>"  # of a chat, in jinja2's sandbox
 PROGRAMS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "socket.connect", "ctypes.dlopen")
 LIBRARIES = "['/sbin/ldconfig', '-p']"  # ctypes.util.find_library, of packages that look for the C library
-CACHE = str(Path("tightrope", "control", "engine", "cache.py"))  # numba's compile cache: an exception
+# numba's compile cache: an exception
+CACHE = str(Path("tightrope", "control", "engine", "compiled", "cache.py"))
 SPAWN, BEGUN = str(Path("multiprocessing", "spawn.py")), str(Path("multiprocessing", "process.py"))
 TESTS = Path(__file__).parents[1]
 SOURCE = str(TESTS.parent / "src")

@@ -38,7 +38,7 @@ import gymnasium
 import pytest
 from source_tree import ROOT, Block, blocks, files, name_of, pages
 
-from tightrope.cli import main
+from tightrope.cli.main import main
 
 TRAINING = ["--total-steps", "2048", "--evaluate-every", "0.5", "--evaluation-episodes", "2"]
 RESUMING = ["--total-steps", "3072"]

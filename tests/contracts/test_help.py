@@ -6,13 +6,13 @@ import argparse
 
 import pytest
 
-from tightrope import options
-from tightrope.algorithms.settings import range_text
+from tightrope.cli import options
+from tightrope.cli.flags import Parser, settings_fields
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
-from tightrope.flags import Parser, settings_fields
+from tightrope.settings.fields import range_text
 
 PARSERS = {
-    **{f"train --algorithm {name}": options.train_parser(name) for name in ALGORITHM_SETTINGS},
+    **{f"train --algorithm {name}": options.training_parser("train", name) for name in ALGORITHM_SETTINGS},
     "evaluate": options.evaluate_parser(),
     "record": options.record_parser(),
     "resume": options.resume_parser(),

@@ -50,15 +50,15 @@ REWARD_NAMED_BY_THE_USER = "--reward FILE.py:function: code named on the command
 OWN_NAMES = "imports the package's own modules, whose names stand in its source"
 SCIPY = "loads scipy's own BLAS extension from where scipy is installed"
 EXCEPTIONS = {
-    ("control/workers.py", "CloudpickleWrapper"): TRANSPORT,
-    ("control/workers.py", "multiprocessing"): TRANSPORT,
-    ("control/engine/cache.py", "pickle"): CACHE,
-    ("control/engine/compiled.py", "exec_module"): SCIPY,
-    ("cli.py", "import_module"): NAMED_BY_THE_USER,
-    ("cli.py", "exec_module"): NAMED_BY_THE_USER,
-    ("cli.py", "spec_from_file_location"): NAMED_BY_THE_USER,
-    ("language/rewards.py", "exec_module"): REWARD_NAMED_BY_THE_USER,
-    ("language/rewards.py", "spec_from_file_location"): REWARD_NAMED_BY_THE_USER,
+    ("control/environments/processes.py", "CloudpickleWrapper"): TRANSPORT,
+    ("control/environments/processes.py", "multiprocessing"): TRANSPORT,
+    ("control/engine/compiled/cache.py", "pickle"): CACHE,
+    ("control/engine/compiled/primitives.py", "exec_module"): SCIPY,
+    ("cli/main.py", "import_module"): NAMED_BY_THE_USER,
+    ("cli/main.py", "exec_module"): NAMED_BY_THE_USER,
+    ("cli/main.py", "spec_from_file_location"): NAMED_BY_THE_USER,
+    ("language/reward/functions.py", "exec_module"): REWARD_NAMED_BY_THE_USER,
+    ("language/reward/functions.py", "spec_from_file_location"): REWARD_NAMED_BY_THE_USER,
     ("__init__.py", "import_module"): OWN_NAMES,
     ("language/__init__.py", "import_module"): OWN_NAMES,
 }

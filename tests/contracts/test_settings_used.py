@@ -18,10 +18,11 @@ DECLARED_IN = {
     SRC / name
     for name in (
         "algorithms/settings.py",
+        "settings/fields.py",
         "control/settings.py",
         "control/presets.py",
-        "options.py",
-        "flags.py",
+        "cli/options.py",
+        "cli/flags.py",
     )
 }
 

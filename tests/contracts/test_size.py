@@ -8,7 +8,8 @@ from typing import Any
 
 from source_tree import name_of, sources, tree
 
-FILE, FUNCTION, NESTING, LINE = 350, 60, 4, 110
+FILE, FUNCTION, NESTING, LINE = 500, 60, 4, 110
+SMELL = 350  # lines of a file: ask whether it has one reason to exist, and never split it for the number
 # A ratchet: "path" or "path:function" -> (what it may have, why). An entry that is no longer needed fails.
 EXCEPTIONS: dict[str, tuple[int, str]] = {}
 
@@ -64,7 +65,10 @@ def check(sizes: dict[str, int], budget: int, unit: str) -> None:
 
 
 def test_files():
-    check({name_of(p): len(p.read_text().splitlines()) for p in sources()}, FILE, "lines")
+    sizes = {name_of(p): len(p.read_text().splitlines()) for p in sources()}
+    for name in sorted(sizes, key=sizes.__getitem__, reverse=True)[:10]:
+        print(f"{sizes[name]:>5} {name}{'  (smells)' if sizes[name] > SMELL else ''}")
+    check(sizes, FILE, "lines")
 
 
 def test_functions():

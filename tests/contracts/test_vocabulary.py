@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 from source_tree import ROOT, files, name_of, sources, tree
 
-from tightrope.flags import PEER_NAMES
+from tightrope.cli.flags import PEER_NAMES
 
 # `done` hides whether an episode terminated or was truncated: the most expensive confusion in this field.
 NEVER = {"done", "dones", "is_done", "all_done"}
@@ -58,8 +58,8 @@ def test_no_setting_has_a_second_name():
 
 def test_every_peer_name_leads_to_a_setting():
     """The table of the peers' names points at settings that exist."""
+    from tightrope.cli.flags import settings_fields
     from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
-    from tightrope.flags import settings_fields
 
     kinds = (TrainSettings, *ALGORITHM_SETTINGS.values())
     known = {name for kind in kinds for name in settings_fields(kind)}

@@ -7,8 +7,8 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from tightrope.control.distributions import Distribution
-from tightrope.control.policies import Policy
+from tightrope.control.policy.distributions import Distribution
+from tightrope.control.policy.policy import Policy
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import action_layout, observation_layout
 from tightrope.maths import divergence

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from tightrope.control.autoreset import autoreset_mode
-from tightrope.control.environments import Backend, EnvironmentFault, choose_backend, make_environments
+from tightrope.control.environments.faults import EnvironmentFault
+from tightrope.control.environments.make import Backend, choose_backend, make_environments
+from tightrope.control.environments.vector import autoreset_mode
 
 chain.register()
 COUNT = 40
@@ -173,7 +174,7 @@ def test_a_vector_environment_that_breaks_the_api_is_named(change, message):
 
     environments = make_environments(Odd(2))
     environments.reset(chain.BASE_SEED)
-    with pytest.raises(EnvironmentFault, match=f"Odd at step 1 cannot be used: .*{message}"):
+    with pytest.raises(EnvironmentFault, match=f"Odd at step 1 does not follow Gymnasium's API: .*{message}"):
         environments.step(np.zeros((2, 1), np.float32))
 
 
@@ -259,7 +260,7 @@ def test_squash_needs_bounds():
     environments = make_environments("Pendulum-v1", 1, squash=True)
     environments.reset(0)
     environments.step(np.full((1, 1), 50.0, np.float32))
-    assert environments._copies._own.envs[0].unwrapped.last_u == pytest.approx(2.0)
+    assert environments._group.envs[0].unwrapped.last_u == pytest.approx(2.0)
 
 
 class Unbounded(chain.Chain):

@@ -8,8 +8,8 @@ from gymnasium.vector import AutoresetMode
 from torch import nn
 
 import tightrope
-from tightrope.control.collect import next_values
-from tightrope.control.normalise import ObservationNormaliser, RewardNormaliser
+from tightrope.control.policy.normalise import ObservationNormaliser, RewardNormaliser
+from tightrope.control.rollout.advantages import critic_values
 
 
 def test_reward_scale_by_hand_and_restarts_at_both_kinds_of_end():
@@ -69,8 +69,7 @@ def test_bootstraps_see_normalised_observations_and_statistics_see_no_phantom(mo
     assert float(moments.count) == mask.sum() < 60 or mode == AutoresetMode.SAME_STEP
     second = agent.collector.collect(agent.engine, 30)
     normaliser = agent.normalisers.observations
-    values = agent.engine.values({k: x.reshape(-1, *x.shape[2:]) for k, x in second.inputs.items()})
-    following = next_values(values.reshape(second.logp.shape), second, agent.engine)
+    _, following = critic_values(second, agent.engine)
     checked = 0
     for row, t in np.argwhere(second.mask & (second.truncated | (np.arange(30) == 29)) & ~second.terminated):
         after = second.raw[row, t].copy()

@@ -14,15 +14,16 @@ import pytest
 import torch
 
 import tightrope
-from tightrope.control import states, train
+from tightrope.control import train
 from tightrope.control.agent import Agent
-from tightrope.control.environments import make_environments
+from tightrope.control.environments import state as states
+from tightrope.control.environments.faults import EnvironmentFault
+from tightrope.control.environments.make import make_environments
 from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve
-from tightrope.control.vector import EnvironmentFault
 from tightrope.runs import checkpoint
-from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run
+from tightrope.training.learner import crosses
 
 SMALL = {
     "total_steps": 600, "num_envs": 4, "num_steps": 25, "seed": 3, "minibatch_size": 50, "num_epochs": 2,
@@ -147,13 +148,13 @@ def test_five_hops_end_where_none_does(tmp_path, monkeypatch, kind):
 
 PHASES = {
     "evaluation": (train, "evaluate_agent", 2),
-    "rollout": ("tightrope.control.collect.Environments", "finish", 55),
+    "rollout": ("tightrope.control.environments.pool.EnvironmentPool", "receive", 55),
     "advantages": ("tightrope.control.agent", "to_batch", 4),
-    "minibatch": ("tightrope.algorithms.ppo", "check_first_ratios", 4),
-    "statistics": ("tightrope.control.normalise.Normalisers", "update", 5),
+    "minibatch": ("tightrope.algorithms.descent", "check_first_ratios", 4),
+    "statistics": ("tightrope.control.policy.normalise.Normalisers", "update", 5),
     "row": (Run, "record", 4),
     "episodes": (Run, "record_episodes", 4),
-    "before a save": (train, "save_agent", 2),
+    "before a save": (Agent, "save", 2),
     "inside a save": ("tightrope.runs.checkpoint", "write_file", 4),
     "renaming": ("tightrope.runs.durable", "put", 2),
     "summary": (Run, "finish", 1),
@@ -334,11 +335,11 @@ def test_resume_says_what_it_cannot_promise(tmp_path, monkeypatch):
     killed(settings, tmp_path / "run", monkeypatch, Agent, "_one_update", 4)
     said: list[str] = []
     monkeypatch.setattr(np, "__version__", "0.1")
-    train.resume(tmp_path / "run", report=lambda event, data: said.append(str(data.get("text", ""))))
-    told = [line for line in said if "begin anew" in line or "versions" in line or "->" in line]
+    train.resume(tmp_path / "run", listeners=[lambda event: said.append(str(event))])
+    told = [line for line in said if "begin new episodes" in line or "-> 0.1" in line]
     assert len(told) == 2, said
     assert "numpy" in told[0] and "-> 0.1 since the checkpoint" in told[0]
-    assert "4 environments begin anew at step 200" in told[1]
+    assert "4 environments begin new episodes at step 200" in told[1]
 
 
 def test_evaluating_twice_gives_the_same(whole):

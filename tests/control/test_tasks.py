@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from tightrope.control import tasks
-from tightrope.control.environments import make_environments
+from tightrope.control.environments import tasks
+from tightrope.control.environments.make import make_environments
 
 chain.register()
 
@@ -134,7 +134,7 @@ import importlib.util
 real = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *a: None if name == {module!r} else real(name, *a)
 sys.meta_path.insert(0, Blocked())
-from tightrope.control.environments import make_environments
+from tightrope.control.environments.make import make_environments
 try:
     make_environments({env_id!r}, 2, backend="serial")
 except ValueError as error:
@@ -221,7 +221,7 @@ def test_standard_tasks_say_nothing_on_stderr(env_id, tmp_path):
         pytest.importorskip({"L": "Box2D", "H": "mujoco"}.get(env_id[0], "gymnasium"))
     code = f"""
 import numpy as np
-from tightrope.control.environments import make_environments
+from tightrope.control.environments.make import make_environments
 with make_environments({env_id!r}, 8) as e:
     e.reset(0)
     for _ in range(30):

@@ -14,9 +14,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tightrope.control import workers
-from tightrope.control.environments import EnvironmentFault, make_environments
-from tightrope.control.faults import FaultPolicy
+from tightrope.control.environments import processes as workers
+from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy
+from tightrope.control.environments.make import make_environments
 
 COUNT = 40
 
@@ -209,11 +209,11 @@ import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may start us with it ignored
 sys.path.insert(0, {here!r})
 import chain
-from tightrope.control.environments import make_environments
+from tightrope.control.environments.make import make_environments
 sets = [make_environments(chain.Chain, 3, backend="workers", num_workers=3) for _ in range(2)]
 for environments in sets:
     environments.reset(100)
-print(*[w._process.pid for e in sets for w in e._copies._workers], flush=True)
+print(*[w._process.pid for e in sets for w in e._workers], flush=True)
 {after}
 """
 
@@ -262,5 +262,5 @@ def test_workers_start_by_spawn_where_there_is_no_fork(monkeypatch):
 
 
 def test_worker_code_does_not_need_torch():
-    code = "import sys, tightrope.control.environments as e; assert 'torch' not in sys.modules"
+    code = "import sys, tightrope.control.environments.make as e; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

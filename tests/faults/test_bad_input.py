@@ -9,9 +9,9 @@ import torch
 from gymnasium import spaces
 
 import tightrope
-from tightrope.cli import main
-from tightrope.control.collect import BadNumbers
-from tightrope.control.environments import EnvironmentFault
+from tightrope.cli.main import main
+from tightrope.control.environments.faults import EnvironmentFault
+from tightrope.control.rollout.rollout import BadNumbers
 
 SMALL = dict(num_envs=2, num_steps=16, minibatch_size=16, num_epochs=1, seed=0)
 
@@ -241,7 +241,7 @@ def test_predict_refuses_a_mask_that_forbids_everything():
     [
         ({"gamma": "0.9"}, "expected float"),
         ({"hidden": 64}, "tuple"),
-        ({"n_steps": 5}, "Did you mean num_steps"),
+        ({"n_steps": 5}, "Did you mean 'num_steps'"),
     ],
 )
 def test_python_settings_of_the_wrong_kind_are_named(values, words):

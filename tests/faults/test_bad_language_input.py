@@ -6,7 +6,7 @@ import time
 import pytest
 from language.tiny import saved
 
-from tightrope.cli import main
+from tightrope.cli.main import main
 from tightrope.language import align
 from tightrope.runs.run import Run
 
@@ -143,9 +143,9 @@ class Rows:
 
 
 def test_a_dataset_object_serves_every_stage_and_a_dictionary_of_them_is_named(place, tmp_path):
-    from tightrope.language.reward_model import train_reward
     from tightrope.language.settings import RewardSettings, SFTSettings
-    from tightrope.language.sft import train_sft
+    from tightrope.language.supervised.preferences import train_reward
+    from tightrope.language.supervised.sft import train_sft
 
     model = str(place / "model")
     usual = {"model": model, "max_tokens": 16, "lora_rank": 2, "threads": 1}

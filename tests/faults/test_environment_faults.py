@@ -20,11 +20,12 @@ import torch
 from gymnasium import spaces
 
 import tightrope
-from tightrope.cli import main
-from tightrope.control.collect import BadNumbers
-from tightrope.control.environments import EnvironmentFault, make_environments
-from tightrope.control.faults import FaultPolicy, pause, renewed_seed
+from tightrope.cli.main import main
+from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy, pause, restart_seed
+from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.processes import STEP
 from tightrope.control.resolve import resolve
+from tightrope.control.rollout.rollout import BadNumbers
 from tightrope.control.train import resume, train
 from tightrope.runs.checkpoint import step_of
 
@@ -214,7 +215,7 @@ def test_death_is_survived_to_the_same_bits_each_time(agent_on):
 
 @pytest.mark.parametrize(("how", "rows"), [("raise", [3]), ("exit", [2, 3])])
 def test_the_failed_step_does_not_count_and_the_one_before_is_bootstrapped(how, rows, agent_on):
-    from tightrope.control.collect import to_batch
+    from tightrope.control.rollout.advantages import to_batch
 
     plain = {"normalise_observations": False, "normalise_rewards": False}
     agent = agent_on(how, on_env_fault="restart", length=12, **plain)
@@ -227,7 +228,7 @@ def test_the_failed_step_does_not_count_and_the_one_before_is_bootstrapped(how, 
     assert rollout.mask[others].all() and not rollout.terminated.any()
     # the episode that was cut is none; the next ones begin anew behind it, with a seed of their own
     assert rollout.episodes == [(12.0, 12, False)] * len(others)
-    seeds = [renewed_seed(SMALL["seed"], 1, row) for row in rows]
+    seeds = [restart_seed(SMALL["seed"], 1, row) for row in rows]
     np.testing.assert_array_equal(rollout.inputs["flat"][rows, column + 1, 0], np.float32(seeds))
     assert (agent.collector._lengths[rows] == 16 - AT).all()
     batch = to_batch(rollout, agent.engine, agent.normalisers, agent.settings.update)
@@ -251,7 +252,7 @@ def test_an_environment_that_fails_only_in_the_reset_after_an_episode_loses_no_s
         assert first.cut is None and second.cut is None and third.cut is None
         assert second.truncated.all() and second.rewards.tolist() == [1.0, 1.0]
         assert second.final_inputs["flat"][:, 1].tolist() == [2.0, 2.0]
-        assert second.inputs["flat"][:, 0].tolist() == [np.float32(renewed_seed(5, 1, 0)), 0.0]
+        assert second.inputs["flat"][:, 0].tolist() == [np.float32(restart_seed(5, 1, 0)), 0.0]
         assert environments.restarts == 1
 
 
@@ -262,7 +263,7 @@ def test_an_environment_that_always_fails_ends_the_run_after_so_many_restarts(ho
     with pytest.raises(EnvironmentFault, match="max_env_restarts allows no more") as caught:
         agent.learn(1000)
     assert time.monotonic() - begin < 20
-    assert re.search(r"made anew [34] times", str(caught.value))
+    assert re.search(r"restarted [34] times", str(caught.value))
 
 
 def test_pauses_grow_and_stay_bounded():
@@ -391,9 +392,9 @@ def test_hung_workers_are_ended_side_by_side():
         lambda: Frail("hang", always=True), 9, backend="workers", num_workers=9, policy=policy
     )
     environments.reset(SMALL["seed"])
-    for worker in environments._copies._workers:
+    for worker in environments._workers:
         for _ in range(AT):
-            worker.tell(b"s")
+            worker.send(STEP)
     time.sleep(0.5)
     begin = time.monotonic()
     environments.close()
@@ -459,7 +460,7 @@ def test_a_vector_environment_of_the_users_own_is_named_and_cannot_be_made_anew(
         agent.learn(1000)
     text = str(caught.value)
     assert "at step 5" in text and "seed 5" in text and "last action [[" in text
-    assert "cannot be made anew" in text and "Traceback" in text
+    assert "cannot be restarted" in text and "Traceback" in text
     agent.close()
     vector.close()
 

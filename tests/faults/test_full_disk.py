@@ -11,17 +11,17 @@ from typing import Any
 import pytest
 from language.tiny import saved
 
-from tightrope.cli import main
+from tightrope.cli.main import main
 from tightrope.control.resolve import resolve
 from tightrope.control.train import resume, train
 from tightrope.language import align
-from tightrope.language.alignment import resume_align
+from tightrope.language.alignment.align import resume_align
 from tightrope.language.settings import AlignSettings, SFTSettings
-from tightrope.language.sft import resume_sft, train_sft
+from tightrope.language.supervised.sft import resume_sft, train_sft
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import CannotWrite
-from tightrope.runs.report import shown
 from tightrope.runs.run import Run
+from tightrope.training.events import Message
 
 SMALL = {"total_steps": 256, "num_envs": 2, "num_steps": 32, "evaluate_every": None, "engine": "torch"}
 FACTS = [{"text": f"{a} is {b}."} for a, b in zip("abcdefgh", "ponmlkji", strict=True)]
@@ -35,12 +35,12 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def run_control(folder: Path, report: Any, model: str) -> Any:
     settings = resolve("CartPole-v1", "ppo", {**SMALL, **MORE, "minibatch_size": 64})
-    return train(settings, run_dir=folder, report=report)
+    return train(settings, run_dir=folder, listeners=[report])
 
 
 def run_sft(folder: Path, report: Any, model: str) -> Any:
     settings = SFTSettings(model=model, held_out=0.0, minibatch_size=2, max_tokens=32, **MORE)
-    return train_sft(settings, data=FACTS, run_dir=folder, report=report)
+    return train_sft(settings, data=FACTS, run_dir=folder, listeners=[report])
 
 
 def lengths(prompts: list[str], completions: list[str], **columns: Any) -> list[float]:
@@ -50,7 +50,7 @@ def lengths(prompts: list[str], completions: list[str], **columns: Any) -> list[
 def run_align(folder: Path, report: Any, model: str) -> Any:
     settings = AlignSettings(model=model, total_episodes=16, batch_size=4, max_new_tokens=3, **MORE)
     values = {"minibatch_size": 4, "num_epochs": 1}
-    return align(settings, prompts=["a", "b"], reward=lengths, run_dir=folder, report=report, **values)
+    return align(settings, prompts=["a", "b"], reward=lengths, run_dir=folder, listeners=[report], **values)
 
 
 STORIES = {
@@ -84,8 +84,8 @@ def test_a_checkpoint_that_fails_in_the_middle_is_said_and_training_goes_on(
 ) -> None:
     run, _ = STORIES[story]
     told: list[str] = []
-    report = lambda event, data: told.append(shown(data) if event == "line" else "")  # noqa: E731
-    run(tmp_path / "whole", lambda event, data: None, model)
+    report = lambda event: told.append(str(event) if isinstance(event, Message) else "")  # noqa: E731
+    run(tmp_path / "whole", lambda event: None, model)
     with monkeypatch.context() as patch:
         refusing(patch, {2, 3})
         run(tmp_path / "run", report, model)
@@ -108,7 +108,7 @@ def test_the_last_checkpoint_must_be_written_and_the_run_can_go_on(
     with monkeypatch.context() as patch:
         refusing(patch, {4})
         with pytest.raises(CannotWrite, match=r"step-.* cannot be written \(No space left"):
-            run(tmp_path / "run", lambda event, data: None, model)
+            run(tmp_path / "run", lambda event: None, model)
     assert len(steps(tmp_path / "run")) == 3 and not (tmp_path / "run" / "summary.json").exists()
     go_on(tmp_path / "run")
     assert (tmp_path / "run" / "summary.json").exists()

@@ -13,10 +13,10 @@ from language.tiny import VOCABULARY, saved, tiny_llama
 
 from tightrope.algorithms.memory import OutOfMemory
 from tightrope.algorithms.nonfinite import NonFiniteError
-from tightrope.language.rewards import RewardError, Rewards
+from tightrope.language.alignment.iteration import Trainer
+from tightrope.language.reward.functions import RewardError, Rewards
 from tightrope.language.settings import AlignSettings
-from tightrope.language.trainer import Trainer
-from tightrope.runs.report import silent
+from tightrope.training.events import Listeners
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def trainer(folder, **values):
         "num_epochs": 1, "learning_rate": 1e-3,
     }  # fmt: skip
     settings = AlignSettings(model=folder).with_values(**{**usual, **values})
-    return Trainer(settings, ["ab", "cde", "f"], "length", None, silent)
+    return Trainer(settings, ["ab", "cde", "f"], "length", None, Listeners())
 
 
 def trained(made):
@@ -61,7 +61,7 @@ def test_responses_without_end_and_without_text_train(tmp_path, what, stops, tok
     source = with_stops(tmp_path / "model", stops or [3])
     more = {"samples_per_prompt": 2} if critic == "none" else {}
     made = trainer(source, max_new_tokens=tokens, ignore_eos=stops is None, critic=critic, kl=kl, **more)
-    for metrics, rows in made.iterate():
+    for metrics, rows in ((u.metrics, u.samples) for u in made.iterate()):
         assert metrics["objective/truncated_fraction"] == cut == 1.0 - metrics["objective/eos_fraction"]
         assert metrics["objective/response_length"] == length
         assert math.isfinite(metrics["train/policy_gradient_loss"])
@@ -90,7 +90,7 @@ def test_responses_without_end_and_without_text_train(tmp_path, what, stops, tok
     ],
 )
 def test_a_bad_number_is_named_before_the_step(folder, site, words, bad, monkeypatch):
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     made = trainer(folder)
     if site == "weight":
@@ -127,12 +127,12 @@ def test_a_bad_number_is_named_before_the_step(folder, site, words, bad, monkeyp
 
 
 def test_a_minibatch_that_does_not_fit_is_halved_told_and_remembered(folder, monkeypatch):
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     results = []
     for fits in (100, 3):
         made, lines = trainer(folder, total_episodes=24), []
-        made.report = lambda event, data, lines=lines: lines.append(data["text"])
+        made.listeners.add(lambda event, lines=lines: lines.append(event.text))
         whole, sizes = module.PolicyModel.__call__, []
 
         def asked(self, part, fits=fits, sizes=sizes, whole=whole):
@@ -143,7 +143,7 @@ def test_a_minibatch_that_does_not_fit_is_halved_told_and_remembered(folder, mon
 
         with monkeypatch.context() as patch:
             patch.setattr(module.PolicyModel, "__call__", asked)
-            rows = [metrics for metrics, _ in made.iterate()]
+            rows = [update.metrics for update in made.iterate()]
         results.append(trained(made))
         if fits == 3:
             assert sizes == [8, 4, 2, 2, 2, 2] + [2] * 8  # tried once, remembered for the rest of the run
@@ -154,7 +154,7 @@ def test_a_minibatch_that_does_not_fit_is_halved_told_and_remembered(folder, mon
 
 
 def test_sampling_that_does_not_fit_ends_with_advice(folder, monkeypatch):
-    from tightrope.language import collect
+    from tightrope.language.alignment import experience as collect
 
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
@@ -165,20 +165,22 @@ def test_sampling_that_does_not_fit_ends_with_advice(folder, monkeypatch):
 
 
 def test_a_rollout_whose_gradients_do_not_fit_goes_on_without_keeping_them(folder, monkeypatch):
-    from tightrope.language import collect
-    from tightrope.language.policy_model import PolicyModel
+    from tightrope.language.alignment import experience as collect
+    from tightrope.language.policy.policy_model import PolicyModel
 
-    whole, init, results, kept = collect._look, PolicyModel.__init__, [], []
+    whole, init, results, kept = collect._evaluate, PolicyModel.__init__, [], []
 
     def full(*arguments):
         if torch.is_grad_enabled():
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return whole(*arguments)
 
-    counted = lambda *a, said=None, **k: kept.append(said is not None) or init(*a, said=said, **k)  # noqa: E731
+    counted = lambda *a, first_pass=None, **k: (  # noqa: E731
+        kept.append(first_pass is not None) or init(*a, first_pass=first_pass, **k)
+    )
     monkeypatch.setattr(PolicyModel, "__init__", counted)
     for look in (whole, full):
-        monkeypatch.setattr(collect, "_look", look)
+        monkeypatch.setattr(collect, "_evaluate", look)
         made = trainer(folder)
         assert len(list(made.iterate())) == 2
         results.append(trained(made))
@@ -188,14 +190,14 @@ def test_a_rollout_whose_gradients_do_not_fit_goes_on_without_keeping_them(folde
 
 def test_a_pass_that_failed_for_memory_is_held_by_nothing(folder, monkeypatch):
     """Its graph, that of the rollout's pass, is gone before the minibatch is done again in halves."""
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     made, graphs, alive = trainer(folder, total_episodes=8, kl="exact-split"), [], []
     loss, gather = module.kl_loss, module.gather
 
     def remembered(*arguments, **how):
         experience = gather(*arguments, **how)
-        graphs.extend(weakref.ref(x) for x in experience.said)
+        graphs.extend(weakref.ref(x) for x in vars(experience.first_pass).values())
         return experience
 
     def full(*arguments):
@@ -256,7 +258,7 @@ def test_a_faulty_reward_masks_and_counts_and_another_one_stays_what_it_is(kind)
     assert scores.metrics[f"rewards/bad/{counter}"] == count
     assert not [name for name in scores.metrics if name.startswith("rewards/good")]
     assert (~scores.valid).sum() == count and np.isnan(scores.total[~scores.valid]).all()
-    from tightrope.runs.metrics import check_names
+    from tightrope.metrics.table import check_names
 
     check_names(scores.metrics)
     with pytest.raises(RewardError, match="'bad'"):
@@ -281,9 +283,9 @@ def test_batches_without_one_score_teach_nothing_and_the_run_goes_on(folder, cri
         return [math.nan] * 8 if calls[0] <= 2 else [x + k for k, x in enumerate(scored)]
 
     made = trainer(folder, total_episodes=32, critic=critic, kl_goal=1.0, samples_per_prompt=2)
-    made.judge = Trainer(made.settings, ["ab", "cde", "f"], late, None, silent).judge
+    made.judge = Trainer(made.settings, ["ab", "cde", "f"], late, None, Listeners()).judge
     before, seen = trained(made), []
-    for metrics, rows in made.iterate():
+    for metrics, rows in ((u.metrics, u.samples) for u in made.iterate()):
         seen.append((metrics["objective/masked_samples"], torch.equal(trained(made), before)))
         assert len(rows) == 8 and ("train/grad_norm" in metrics) == (metrics["objective/masked_samples"] == 0)
     assert seen == [(8.0, True), (8.0, True), (0.0, False), (0.0, False)]

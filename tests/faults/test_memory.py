@@ -50,7 +50,7 @@ def test_the_step_is_the_same_in_halves(rule, error):
     assert passes == [6, 3, 2, 2, 2]
     assert metrics["train/micro_batch_size"] == 2 and metrics["train/memory_halvings"] == 2
     assert "train/memory_halvings" not in plain
-    for name, value in plain.items():  # and so are the books, none counted twice
+    for name, value in plain.items():  # and so are the sums, none counted twice
         assert metrics[name] == pytest.approx(value, rel=1e-6, abs=1e-7), name
 
 
@@ -98,9 +98,9 @@ def test_a_single_row_that_does_not_fit_ends_with_advice():
 
 
 def test_supervised_steps_are_halved_likewise():
-    from tightrope.algorithms.optimise import Brake
-    from tightrope.language.fitting import Objective, take_step
+    from tightrope.algorithms.optimise import StepGuard
     from tightrope.language.settings import SFTSettings
+    from tightrope.language.supervised.fit import Objective, take_step
 
     results = []
     for fits in (9, 2):
@@ -115,8 +115,8 @@ def test_supervised_steps_are_halved_likewise():
 
         objective = Objective("sft", "sft", [], loss, lambda item: 1, lambda item: int(item), dict)
         optimiser = torch.optim.SGD([weight], lr=1.0)
-        brake, items = Brake(torch.device("cpu")), [1.0, 2.0, 3.0, 4.0, 5.0]
-        metrics = take_step(objective, items, optimiser, brake, SFTSettings())
+        guard, items = StepGuard(torch.device("cpu")), [1.0, 2.0, 3.0, 4.0, 5.0]
+        metrics = take_step(objective, items, optimiser, guard, SFTSettings())
         assert metrics["sft/figure"] == 1.0
         results.append(weight.detach())
     assert sizes == [5, 3, 2, 2, 1]

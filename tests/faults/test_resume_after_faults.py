@@ -11,12 +11,14 @@ from control.test_resume import Walk, assert_same_end, killed, settings_for
 from language.tiny import saved
 
 from tightrope.algorithms.nonfinite import NonFiniteError
-from tightrope.control import copies, train, vector
+from tightrope.control import train
 from tightrope.control.agent import Agent
+from tightrope.control.environments import faults
 from tightrope.language import align
-from tightrope.language.alignment import resume_align
-from tightrope.language.trainer import Trainer
+from tightrope.language.alignment.align import resume_align
+from tightrope.language.alignment.iteration import Trainer
 from tightrope.runs.run import Run
+from tightrope.training.events import Event, Updated
 
 
 class Brittle(Walk):
@@ -42,8 +44,7 @@ class Sealed(Brittle):
 
 @pytest.mark.parametrize(("env", "workers"), [(Brittle, 1), (Brittle, 2), (Sealed, 1)])
 def test_restarts_are_counted_on_and_seeds_of_those_made_anew_go_on(tmp_path, monkeypatch, env, workers):
-    for module in (copies, vector):
-        monkeypatch.setattr(module, "pause", lambda *_: 0.0)
+    monkeypatch.setattr(faults, "pause", lambda *_: 0.0)
     settings = settings_for(
         env, on_env_fault="restart", max_env_restarts=500, num_workers=workers, engine="torch"
     )
@@ -119,12 +120,12 @@ def test_a_language_run_keeps_its_rollbacks_and_its_micro_batch(tmp_path, monkey
     }  # fmt: skip
     align(**given, **how, run_dir=tmp_path / "whole")
 
-    def die(event: str, data: dict[str, Any]) -> None:
-        if event == "update" and data["step"] == 20:
+    def die(event: Event) -> None:
+        if isinstance(event, Updated) and event.step == 20:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        align(**given, **how, run_dir=tmp_path / "hops", report=die)
+        align(**given, **how, run_dir=tmp_path / "hops", listeners=[die])
     resume_align(tmp_path / "hops", **given)
     ends = [Run.open(tmp_path / name).newest() for name in ("whole", "hops")]
     for name in ("rollbacks", "micro_batch_size", "rng", "newest", "episodes"):

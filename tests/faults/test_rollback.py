@@ -9,8 +9,8 @@ from language.tiny import saved
 from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.control.settings import TrainSettings
 from tightrope.control.train import train
-from tightrope.language import align
-from tightrope.runs.rollback import rolling_back
+from tightrope.language import SFTSettings, align, train_sft
+from tightrope.training.events import Message
 
 CONTROL = {
     "num_envs": 2, "num_steps": 32, "minibatch_size": 64, "num_epochs": 1, "hidden": (8,), "total_steps": 640,
@@ -43,11 +43,11 @@ def test_control_goes_back_goes_on_and_counts(engine, monkeypatch, tmp_path):
     seen, lines = poison(monkeypatch, 2), []
     settings = TrainSettings().with_values(**CONTROL, engine=engine)
 
-    def report(event, data):
-        if event == "line":
-            lines.append(data["text"])
+    def report(event):
+        if isinstance(event, Message):
+            lines.append(event.text)
 
-    summary = train(settings, run_dir=tmp_path / "run", report=report)
+    summary = train(settings, run_dir=tmp_path / "run", listeners=[report])
     assert summary["steps"] == 640
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [64 * k for k in range(1, 11)]  # none twice, none missing
@@ -72,7 +72,7 @@ def test_without_a_checkpoint_it_ends_and_says_so(monkeypatch, tmp_path):
 
 
 def test_language_goes_back_goes_on_and_counts(monkeypatch, tmp_path):
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     model, whole, calls, texts = saved(tmp_path / "model"), module.to_batch, [0], []
 
@@ -90,7 +90,7 @@ def test_language_goes_back_goes_on_and_counts(monkeypatch, tmp_path):
     run = align(
         model=model, prompts=["ab", "cd"], reward="length", run_dir=tmp_path / "run", total_episodes=32,
         batch_size=8, minibatch_size=8, max_new_tokens=4, lora_rank=2, checkpoint_every=0.5, max_rollbacks=1,
-        normalise_advantages=False, report=lambda event, data: lines.append(str(data.get("text"))),
+        normalise_advantages=False, listeners=[lambda event: lines.append(str(event))],
     )  # fmt: skip
     rows = run.metrics
     assert [row["step"] for row in rows] == [8, 16, 24, 32]
@@ -99,10 +99,41 @@ def test_language_goes_back_goes_on_and_counts(monkeypatch, tmp_path):
     assert texts[0] != texts[1]
 
 
-def test_only_bad_numbers_are_gone_back_for():
-    def updates():
-        yield 1
-        raise ValueError("something else")
+def test_only_bad_numbers_are_gone_back_for(monkeypatch, tmp_path):
+    from tightrope.control import agent as module
 
+    monkeypatch.setattr(module, "to_batch", lambda *_: int("something else"))
+    settings = TrainSettings().with_values(**CONTROL, engine="torch")
     with pytest.raises(ValueError, match="something else"):
-        list(rolling_back(updates, None, lambda point: pytest.fail("went back"), print, limit=3))
+        train(settings, run_dir=tmp_path / "run")
+
+
+@pytest.mark.parametrize("limit", [0, 1])
+def test_sft_goes_back_too(limit, monkeypatch, tmp_path):
+    from tightrope.language.supervised import fit as module
+
+    real, batches = module.take_step, []
+
+    def poisoned(objective, minibatch, *arguments):
+        batches.append([row.tokens.tolist() for row in minibatch])
+        if len(batches) == 4:
+            raise NonFiniteError("The loss is nan.")
+        return real(objective, minibatch, *arguments)
+
+    monkeypatch.setattr(module, "take_step", poisoned)
+    settings = SFTSettings(
+        model=saved(tmp_path / "model"), num_epochs=1, minibatch_size=2, checkpoint_every=0.2, held_out=0.0,
+        max_tokens=8, max_rollbacks=limit, lora_rank=2,
+    )  # fmt: skip
+    data, lines = [{"text": "abcdefghijklmnop"[k : k + 4]} for k in range(10)], []
+    given = {"data": data, "run_dir": tmp_path / "run", "listeners": [lambda event: lines.append(str(event))]}
+    if not limit:
+        with pytest.raises(NonFiniteError):
+            train_sft(settings, **given)
+        return
+    train_sft(settings, **given)
+    rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3, 4, 5]
+    assert [row.get("train/rollbacks", 0.0) for row in rows] == [0.0] * 3 + [1.0] * 2
+    assert any("Going back to the checkpoint of step 3, 1 of 1 times" in line for line in lines)
+    assert batches[3] != batches[4]

@@ -9,11 +9,12 @@ import torch
 from language.tiny import padded, saved, tiny_gpt2
 
 from tightrope.algorithms import ppo
-from tightrope.cli import main
+from tightrope.cli.main import main
 from tightrope.language import align
-from tightrope.language.alignment import resume_align
+from tightrope.language.alignment.align import resume_align
+from tightrope.language.model.trunk import Trunk
 from tightrope.language.settings import AlignSettings
-from tightrope.language.trunk import Trunk
+from tightrope.training.events import Finished, Updated
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
 FAST = {
@@ -65,8 +66,8 @@ def test_it_learns_what_is_rewarded(folder, tmp_path):
 def test_every_choice_runs(folder, tmp_path, values):
     seen = []
     run = align(model=folder, prompts=PROMPTS, reward=letters, run_dir=tmp_path / "run",
-                report=lambda event, data: seen.append(event), **{**FAST, **values})  # fmt: skip
-    assert len(run.metrics) == 4 and seen[-1] == "finish"
+                listeners=[lambda event: seen.append(event)], **{**FAST, **values})  # fmt: skip
+    assert len(run.metrics) == 4 and isinstance(seen[-1], Finished)
     assert all(np.isfinite(v) for row in run.metrics for v in row.values() if v is not None)
     if "kl_goal" in values:
         assert run.metrics[-1]["objective/kl_beta"] != run.metrics[0]["objective/kl_beta"]
@@ -134,12 +135,12 @@ def test_a_run_that_goes_on_ends_where_one_without_a_break_does(folder, tmp_path
     class Cut(Exception):
         pass
 
-    def stop(event, data):
-        if event == "update" and data["step"] >= 48:
+    def stop(event):
+        if isinstance(event, Updated) and event.step >= 48:
             raise Cut
 
     with pytest.raises(Cut):
-        align(model=folder, run_dir=half, report=stop, **given, **values)
+        align(model=folder, run_dir=half, listeners=[stop], **given, **values)
     for missing in ("reward", "gold"):
         with pytest.raises(ValueError, match=f"The {missing} of .* no file may import"):
             resume_align(half, **{**given, missing: None})
@@ -214,7 +215,7 @@ def test_trl_reward_functions_run_unchanged(folder, tmp_path):
         ({"reward": (letters, float("nan"))}, "finite"),
         ({"kl": "k3-reward"}, "allow-biased-kl"),
         ({"learning_rte": 1.0}, "learning_rate"),
-        ({"init_kl_coef": 0.1}, "Did you mean kl_beta"),
+        ({"init_kl_coef": 0.1}, "Did you mean 'kl_beta'"),
         ({"model": "no such model"}, "no such model"),
         ({"lora_layers": 9}, "layers"),
         ({"minibatch_size": 0}, "minibatch_size"),
@@ -230,7 +231,7 @@ def test_mistakes_are_named(folder, tmp_path, values, words):
 def test_a_biased_kl_runs_with_a_warning_that_names_the_bias(folder, tmp_path):
     lines = []
     align(model=folder, prompts=PROMPTS, reward=letters, run_dir=tmp_path / "run", kl="k3-reward",
-          allow_biased_kl=True, report=lambda event, data: lines.append(str(data.get("text"))),
+          allow_biased_kl=True, listeners=[lambda event: lines.append(str(event))],
           **{**FAST, "total_episodes": 16})  # fmt: skip
     assert any("k3 in the reward" in line for line in lines)
 
@@ -289,7 +290,8 @@ def test_the_doctor_finds_nothing_wrong_with_a_healthy_model(folder, capsys):
 
 def test_the_doctor_finds_a_model_that_reads_its_padding(folder, monkeypatch):
     """A trunk that ignores its mask and positions: the gradient depends on padding, sampling on the cache."""
-    from tightrope.language import selfcheck, trunk
+    from tightrope.language import selfcheck
+    from tightrope.language.model import trunk
 
     real = trunk._run
 

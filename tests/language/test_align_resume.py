@@ -12,11 +12,12 @@ import pytest
 import torch
 from language.tiny import saved, tiny_llama
 
-from tightrope.cli import main
-from tightrope.language import alignment, trainer
-from tightrope.language.alignment import align, resume_align
-from tightrope.language.evaluate import sample_run
-from tightrope.language.trainer import Trainer
+from tightrope.cli.main import main
+from tightrope.language.alignment import align as alignment
+from tightrope.language.alignment import iteration as trainer
+from tightrope.language.alignment.align import align, resume_align
+from tightrope.language.alignment.iteration import Trainer
+from tightrope.language.compare import sample_run
 from tightrope.runs import checkpoint, signals
 from tightrope.runs.lock import RunInUse
 from tightrope.runs.run import Run
@@ -184,7 +185,7 @@ def test_other_prompts_and_less_than_was_done_are_refused(tmp_path, values, whol
         resume_align(run, **GIVEN, total_episodes=24)
     assert ((run / "summary.json").read_bytes(), (run / "settings.json").read_bytes()) == before
     told = []
-    again = resume_align(run, **GIVEN, report=lambda event, data: told.append(data.get("text", "")))
+    again = resume_align(run, **GIVEN, listeners=[lambda event: told.append(str(event))])
     assert any("--total-episodes N goes on" in text for text in told)
     assert again.summary["final"] == whole.summary["final"] and again.summary["wall_seconds"] > 0
 
@@ -194,7 +195,7 @@ def test_a_negative_seed_of_sampling_is_refused(whole):
         sample_run(whole.path, seed=-1)
 
 
-@pytest.mark.parametrize("name", ["settings_from_json", "_require_what_no_file_gives", "Trainer"])
+@pytest.mark.parametrize("name", ["AlignSettings.from_json", "_require_what_no_file_gives", "Trainer"])
 def test_a_run_that_somebody_writes_is_refused_before_its_settings_are_looked_at(
     tmp_path, whole, monkeypatch, name
 ):
@@ -203,7 +204,7 @@ def test_a_run_that_somebody_writes_is_refused_before_its_settings_are_looked_at
     def looked(*_: Any, **__: Any) -> Any:
         raise AssertionError("looked at before the lock was ours")
 
-    monkeypatch.setattr(alignment, name, looked)
+    monkeypatch.setattr(f"{alignment.__name__}.{name}", looked)
     with Run.open(run).lock(), pytest.raises(RunInUse, match="this process"):
         resume_align(run, **GIVEN)
     with pytest.raises(AssertionError, match="looked at"):

@@ -12,9 +12,10 @@ import torch
 from language.test_roles import PROMPTS, fresh, settings, shake
 from language.tiny import saved, tiny_llama
 
-from tightrope.language.collect import comparable, describe, gather, kl_share, rewards_of, to_batch
-from tightrope.language.rewards import Scores
-from tightrope.language.trainer import PolicyModel
+from tightrope.language.alignment.experience import comparable, gather, kl_share, rewards_of, to_batch
+from tightrope.language.alignment.figures import describe
+from tightrope.language.alignment.iteration import PolicyModel
+from tightrope.language.reward.functions import Scores
 
 EVERY = torch.ones(6, dtype=torch.bool)
 
@@ -58,8 +59,7 @@ def test_a_value_is_the_critics_of_the_text_before_the_token(folder, critic, lay
         text = experience.tokens[row][experience.real[row]][None]
         length, all_real = int(experience.responses.mask[row].sum()), torch.ones_like(text, dtype=torch.bool)
         with torch.no_grad():
-            policy = roles.policy_hidden(text, all_real, None)
-            hidden = roles.critic_hidden(policy, text, all_real, None)[0]
+            hidden = (roles.critic or roles.policy).hidden(text, all_real)[0]
             every = roles.critic_head(hidden)[:, 0]  # of every prefix: attention is causal
         wanted = every[-length - 1 : -1]
         torch.testing.assert_close(experience.values[row, :length], wanted, rtol=1e-3, atol=1e-4)

@@ -11,16 +11,17 @@ import pytest
 import torch
 from language.tiny import tokenizer
 
-from tightrope.language.data import (
+from tightrope.language.data.batching import (
+    PADDING,
     Example,
+    attention_of,
+    collate,
+    pack,
     pad_left,
     pad_right,
-    preference_pairs,
-    read_prompts,
-    read_rows,
-    sft_examples,
+    row_of,
 )
-from tightrope.language.packing import PADDING, attention_of, collate, pack, row_of
+from tightrope.language.data.examples import preference_pairs, read_prompts, read_rows, sft_examples
 
 EOS = 3
 CHATML = (

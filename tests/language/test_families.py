@@ -7,17 +7,18 @@ import torch
 from language.tiny import VOCABULARY, padded, saved
 
 from tightrope.algorithms.optimise import SamplingMismatch
-from tightrope.language import heads, selfcheck
-from tightrope.language.data import Example
-from tightrope.language.faults import refuse_mismatch
-from tightrope.language.ledger import Job, ledger, reward_model_bytes
-from tightrope.language.models import attention_window, load_causal, parts
-from tightrope.language.packing import collate, row_of
-from tightrope.language.reward_model import load_reward
-from tightrope.language.sampling import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample
-from tightrope.language.sft import require_packable, token_loss
-from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.language.trunk import Trunk
+from tightrope.language import selfcheck
+from tightrope.language.alignment.figures import refuse_mismatch
+from tightrope.language.data.batching import Example, collate, row_of
+from tightrope.language.generation.distribution import Sampling, token_statistics
+from tightrope.language.generation.sample import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample
+from tightrope.language.memory import Job, ledger, reward_model_bytes
+from tightrope.language.model import parts as parts_module
+from tightrope.language.model.load import load_causal
+from tightrope.language.model.parts import attention_window, parts
+from tightrope.language.model.trunk import Trunk
+from tightrope.language.reward.model import load_reward
+from tightrope.language.supervised.sft import require_packable, token_loss
 
 COMMON = {
     "vocab_size": VOCABULARY, "hidden_size": 32, "num_hidden_layers": 4, "num_attention_heads": 2,
@@ -79,9 +80,9 @@ def test_a_factor_behind_the_head_is_in_what_is_sampled_and_trained(name):
 
 
 def test_the_factor_is_exact_and_a_plain_head_has_none():
-    assert getattr(parts(made("cohere")).head, heads.FACTOR) == 0.0625
-    assert getattr(parts(made("granite")).head, heads.FACTOR) == pytest.approx(1 / 13, rel=1e-6)
-    assert getattr(parts(made("mistral")).head, heads.FACTOR) == 1.0
+    assert getattr(parts(made("cohere")).head, parts_module.FACTOR) == 0.0625
+    assert getattr(parts(made("granite")).head, parts_module.FACTOR) == pytest.approx(1 / 13, rel=1e-6)
+    assert getattr(parts(made("mistral")).head, parts_module.FACTOR) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -117,7 +118,7 @@ def test_halves_keep_each_layer_s_window(name, cut):
 
 def test_halves_that_mix_up_windows_are_not_used(monkeypatch):
     """The look that a trunk takes at itself sees a wrong window, however wide the real one is."""
-    from tightrope.language import trunk
+    from tightrope.language.model import trunk
 
     real = trunk._halves
 
@@ -162,7 +163,7 @@ def test_the_doctor_finds_them_healthy(name, tmp_path):
 
 
 def test_the_doctor_compares_with_the_model_s_own_logits(tmp_path, monkeypatch):
-    monkeypatch.setattr(heads, "_factor", lambda *arguments: 1.0)
+    monkeypatch.setattr(parts_module, "_factor", lambda *arguments: 1.0)
     found = selfcheck.check_model(saved(tmp_path, made("granite")))
     assert "log-probabilities are those of model(tokens).logits" in [f.what for f in found if not f.good]
 

@@ -13,7 +13,7 @@ from torch.distributions import Categorical, kl_divergence
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import PPOSettings
-from tightrope.language.kl import (
+from tightrope.language.alignment.kl import (
     BIASED_KL_FORMS,
     KL_FORMS,
     AdaptiveKL,

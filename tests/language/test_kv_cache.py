@@ -8,7 +8,7 @@ import torch
 from language.tiny import tiny_llama
 from torch import nn
 
-from tightrope.language.kv_cache import cached_forward
+from tightrope.language.generation.sample import cached_forward
 
 
 class NewName(nn.Module):

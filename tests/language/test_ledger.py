@@ -8,10 +8,21 @@ import torch
 from transformers import AutoModelForCausalLM, GPT2Config, LlamaConfig
 
 from tightrope.algorithms.optimise import Adam
-from tightrope.language import lora, shapes
-from tightrope.language.kv_cache import cached_forward
-from tightrope.language.ledger import DoesNotFit, Job, Ledger, amount, available_memory, check, job_of, ledger
-from tightrope.language.models import parts, without_dropout
+from tightrope.language import memory
+from tightrope.language.generation.sample import cached_forward
+from tightrope.language.memory import (
+    DoesNotFit,
+    Job,
+    Ledger,
+    amount,
+    available_memory,
+    check,
+    job_of,
+    ledger,
+)
+from tightrope.language.model import lora
+from tightrope.language.model.load import without_dropout
+from tightrope.language.model.parts import parts
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SFTSettings
 
 LLAMA = LlamaConfig(
@@ -100,7 +111,7 @@ def test_the_cache_is_the_real_cache(config) -> None:
 @CONFIGS
 @pytest.mark.parametrize("length", [20, 100])
 def test_activations_are_what_a_real_forward_pass_keeps(config, length) -> None:
-    kept = shapes.saved_bytes(parts(real(config)).base, length)
+    kept = memory.saved_bytes(parts(real(config)).base, length)
     job = Job(tune="full", micro_batch_size=1, prompt_tokens=length)
     found = entry(ledger(config, job), "policy: activations of a micro-batch")
     assert 0.8 * kept < found < 1.25 * kept
@@ -112,7 +123,7 @@ def test_activations_of_an_adapter_are_those_of_the_adapted_layers(config, layer
     model = real(config)
     lora.add_adapter(model, "policy", 4, 8.0, lora.top_layers(model, layers))
     with lora.using(model, "policy"):
-        kept = shapes.saved_bytes(parts(model).base, 60)
+        kept = memory.saved_bytes(parts(model).base, 60)
     job = Job(lora_rank=4, lora_layers=layers, micro_batch_size=1, prompt_tokens=60)
     found = entry(ledger(config, job), "policy: activations of a micro-batch")
     assert 0.8 * kept < found < 1.4 * kept
@@ -135,13 +146,13 @@ def test_a_model_of_seven_billion_takes_no_memory_to_be_counted() -> None:
 
 def test_what_cannot_be_measured_is_estimated(monkeypatch) -> None:
     """A layer that looks at numbers fails where there are none."""
-    measured = shapes.shapes_of(LLAMA, "float32").saved
+    measured = memory.shapes_of(LLAMA, "float32").saved
 
     def fails(base, length):
         raise NotImplementedError("Cannot copy out of meta tensor; no data!")
 
-    monkeypatch.setattr(shapes, "saved_bytes", fails)
-    assert 0.5 * measured < shapes.shapes_of(LLAMA, "float32").saved < 2 * measured
+    monkeypatch.setattr(memory, "saved_bytes", fails)
+    assert 0.5 * measured < memory.shapes_of(LLAMA, "float32").saved < 2 * measured
 
 
 def test_each_saving_saves() -> None:
@@ -298,7 +309,7 @@ def test_this_machine_says_something() -> None:
 
 def told(settings: AlignSettings, **given) -> tuple[Ledger, str]:
     """The ledger that `make_roles` presents before it loads anything, and its text."""
-    from tightrope.language import roles
+    from tightrope.language.policy import roles
 
     class Stop(Exception):
         pass

@@ -4,8 +4,9 @@ import pytest
 import torch
 from language.tiny import padded, tiny_gpt2, tiny_llama
 
-from tightrope.language import lora
-from tightrope.language.trunk import Trunk
+from tightrope.language.model import lora
+from tightrope.language.model.saving import load_adapter, save_adapter
+from tightrope.language.model.trunk import Trunk
 
 MODELS = [tiny_llama, tiny_gpt2]
 
@@ -95,7 +96,7 @@ def test_peft_opens_a_saved_adapter(make, tmp_path):
     tokens, real, _ = padded()
     model = adapted(make, "policy", layers=(1, 2))
     shake(model, "policy")
-    lora.save_adapter(model, "policy", tmp_path, base_model="somewhere")
+    save_adapter(model, "policy", tmp_path, base_model="somewhere")
     with lora.using(model, "policy"):
         wanted = model(input_ids=tokens, attention_mask=real.long()).logits
     theirs = peft.PeftModel.from_pretrained(make(), str(tmp_path))
@@ -106,15 +107,15 @@ def test_peft_opens_a_saved_adapter(make, tmp_path):
 def test_an_adapter_comes_back_from_its_folder(tmp_path):
     model = adapted(tiny_llama, "policy", layers=(2,))
     shake(model, "policy")
-    lora.save_adapter(model, "policy", tmp_path, base_model="somewhere")
+    save_adapter(model, "policy", tmp_path, base_model="somewhere")
     other = tiny_llama()
-    lora.load_adapter(other, "reward", tmp_path)
+    load_adapter(other, "reward", tmp_path)
     for a, b in zip(
         lora.adapter_parameters(model, "policy"), lora.adapter_parameters(other, "reward"), strict=True
     ):
         assert torch.equal(a, b)
     with pytest.raises(ValueError, match="does not fit"):
-        lora.load_adapter(tiny_gpt2(), "reward", tmp_path)
+        load_adapter(tiny_gpt2(), "reward", tmp_path)
 
 
 def test_user_mistakes_are_named():

@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.stats import linregress
 
-from tightrope.language.monitor import FEWEST_POINTS, WINDOWS, Monitor, fit, rising
+from tightrope.language.alignment.monitor import FEWEST_POINTS, WINDOWS, Monitor, fit, rising
 
 ALPHA, BETA, OFFSET = 1.0, 0.4, -0.3
 PEAK_KL = math.exp(ALPHA / BETA - 1) ** 2  # 20.1 nats
@@ -248,7 +248,7 @@ def test_updates_without_gold_or_proxy_are_no_points():
 
 
 def test_the_metric_is_the_fits_and_is_declared():
-    from tightrope.runs.metrics import check_names
+    from tightrope.metrics.table import check_names
 
     monitor = Monitor()
     for kl in (0.0, 2.0, 5.0, 9.0, 14.0):

@@ -33,7 +33,9 @@ def from_library(module: str, category: type[Warning] = FutureWarning) -> None:
     warnings.warn_explicit("`old` is deprecated", category, "file.py", 1, module=module, registry={})
 
 
-@pytest.mark.parametrize("module", ["transformers.models.llama", "torch", "tightrope.language.sampling"])
+@pytest.mark.parametrize(
+    "module", ["transformers.models.llama", "torch", "tightrope.language.generation.sample"]
+)
 def test_deprecations_of_libraries_are_hidden_unless_somebody_asked(module):
     with warnings.catch_warnings(record=True) as seen:
         warnings.resetwarnings()

@@ -10,17 +10,19 @@ import pytest
 import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
-from tightrope.algorithms.optimise import Brake
-from tightrope.language import lora
-from tightrope.language.data import Pair, pad_left, pad_right, preference_pairs
-from tightrope.language.fitting import Objective, take_step
-from tightrope.language.models import load_causal, parts
-from tightrope.language.reward_model import (
-    RewardModel,
+from tightrope.algorithms.optimise import StepGuard
+from tightrope.language.data.batching import pad_left, pad_right
+from tightrope.language.data.examples import Pair, preference_pairs
+from tightrope.language.model import lora
+from tightrope.language.model.load import load_causal
+from tightrope.language.model.parts import parts
+from tightrope.language.model.saving import load_adapter
+from tightrope.language.reward.model import SHIFT, RewardModel, last_real, load_reward
+from tightrope.language.settings import RewardSettings
+from tightrope.language.supervised.fit import Objective, take_step
+from tightrope.language.supervised.preferences import (
     calibration,
     differences,
-    last_real,
-    load_reward,
     longest,
     make_head,
     normalise,
@@ -28,9 +30,8 @@ from tightrope.language.reward_model import (
     right_order,
     train_reward,
 )
-from tightrope.language.reward_saving import SHIFT
-from tightrope.language.settings import RewardSettings
 from tightrope.runs.run import Run
+from tightrope.training.events import Evaluated, Finished, Message, Started, Updated
 
 EOS = 3
 MODELS = [tiny_llama, tiny_gpt2]
@@ -129,7 +130,7 @@ def test_micro_batches_add_up_to_the_minibatch():
         parameters = [*model.base.parameters(), *model.head.parameters()]
         settings = settings_of(micro_batch_size=micro, max_grad_norm=None)
         optimiser = torch.optim.SGD(parameters, lr=0.1)
-        metrics = take_step(objective, pairs, optimiser, Brake(torch.device("cpu")), settings)
+        metrics = take_step(objective, pairs, optimiser, StepGuard(torch.device("cpu")), settings)
         found.append((metrics, [p.detach() for p in parameters]))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-4)
     for a, b in zip(found[0][1], found[1][1], strict=True):
@@ -272,7 +273,7 @@ def test_the_adapter_scores_alike_on_a_trunk_that_is_shared(tmp_path, folder):
     settings = settings_of(folder, tune="lora", lora_layers=2, learning_rate=1e-2)
     train_reward(settings, data=rows, run_dir=tmp_path / "run")
     trunk = load_causal(folder)
-    lora.load_adapter(trunk, "reward", tmp_path / "run" / "adapter")
+    load_adapter(trunk, "reward", tmp_path / "run" / "adapter")
     kept = load_file(tmp_path / "run" / "adapter" / "head.safetensors")
     head = torch.nn.Linear(32, 1, bias=False)
     head.weight.data = kept["score.weight"]
@@ -309,7 +310,7 @@ def test_the_run_folder_tells_what_happened(tmp_path, folder):
     data.write_text("".join(json.dumps(row) + "\n" for row in preferences(40)))
     settings = settings_of(folder, data=str(data), validation=str(data), num_epochs=1)
     events = []
-    summary = train_reward(settings, run_dir=tmp_path / "run", report=lambda *event: events.append(event))
+    summary = train_reward(settings, run_dir=tmp_path / "run", listeners=[lambda event: events.append(event)])
     run = Run.open(tmp_path / "run")
     assert RewardSettings(**run.settings) == settings
     first, *rows = run.read_metrics()
@@ -320,7 +321,8 @@ def test_the_run_folder_tells_what_happened(tmp_path, folder):
     assert held <= set(rows[-1]) and not held & set(rows[0])
     assert summary["held_out_pairs"] == summary["pairs"] == 40
     assert rows[-1]["reward/held_out_accuracy"] == summary["final"]["reward/held_out_accuracy"]
-    assert [kind for kind, _ in events] == ["line", "start", *["update"] * 5, "finish"]
+    assert [type(event) for event in events if not isinstance(event, Evaluated)] == [
+        Message, Started, *[Updated] * 5, Finished]  # fmt: skip
 
 
 def test_same_seed_same_bits_other_seed_others(tmp_path, folder):
@@ -334,7 +336,7 @@ def test_same_seed_same_bits_other_seed_others(tmp_path, folder):
 
 
 def test_pairs_of_one_prompt_are_held_out_together(tmp_path, folder, monkeypatch):
-    from tightrope.language import reward_model
+    from tightrope.language.supervised import preferences as reward_model
 
     seen = {}
     whole = reward_model.hold_out

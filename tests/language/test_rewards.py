@@ -20,8 +20,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tightrope.language.rewards import RewardError, Rewards, length, load_reward_function
-from tightrope.runs.metrics import check_names
+from tightrope.language.reward.functions import RewardError, Rewards, length, load_reward_function
+from tightrope.metrics.table import check_names
 
 PROMPTS = ["The sky is", "The sun is", "The sea is"]
 TEXTS = [" blue.", " in the sky.", " deep!"]

@@ -9,12 +9,14 @@ from language.tiny import saved
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.optimise import make_optimiser
-from tightrope.language import lora, policy_model
-from tightrope.language.collect import gather, rewards_of, to_batch
-from tightrope.language.data import Prompt
-from tightrope.language.policy_model import PolicyModel, length_groups, trimmed
-from tightrope.language.rewards import Scores
-from tightrope.language.roles import make_roles
+from tightrope.language.alignment.experience import gather, rewards_of, to_batch
+from tightrope.language.data import batching
+from tightrope.language.data.batching import length_groups, used_columns
+from tightrope.language.data.examples import Prompt
+from tightrope.language.model import lora
+from tightrope.language.policy.policy_model import PolicyModel
+from tightrope.language.policy.roles import make_roles
+from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings, RLHFSettings
 
 PROMPTS = [Prompt((5, 6, 7), "bcd", {}), Prompt((8, 9), "ef", {}), Prompt((10, 11, 12, 13, 14), "ghijk", {})]
@@ -90,13 +92,13 @@ def test_the_pass_of_the_rollout_is_the_first_of_the_update(folder, tune, critic
     part = to_batch(experience, experience.logp, torch.ones(6, dtype=torch.bool), roles.settings)
     part = part.select(torch.tensor([4, 0, 3]))
     found, weights = [], torch.linspace(-1, 1, part.mask.numel()).view(part.mask.shape)
-    for said in (experience.said, None):
-        model = PolicyModel(roles, exact=roles.settings.exact_in_loss, said=said)
+    for first_pass in (experience.first_pass, None):
+        model = PolicyModel(roles, exact=roles.settings.exact_in_loss, first_pass=first_pass)
         now = model(part)
         total = (now.logp * weights).sum() + now.values.square().sum()
-        total = total + model.kl.sum() if roles.settings.exact_in_loss else total
+        total = total + now.kl.sum() if roles.settings.exact_in_loss else total
         gradients = torch.autograd.grad(total, parameters, allow_unused=True, materialize_grads=True)
-        assert any(bool(g.any()) for g in gradients) and model.said is None
+        assert any(bool(g.any()) for g in gradients) and model.first_pass is None
         found.append([now.logp, now.values, *gradients])
     for kept, own in zip(*found, strict=True):
         torch.testing.assert_close(kept, own, rtol=1e-3, atol=2e-5)
@@ -107,9 +109,9 @@ def test_the_pass_of_the_rollout_is_kept_only_where_one_pass_is_an_epoch(folder,
     assert present.one_pass and not present.with_values(minibatch_size=5).one_pass
     assert not present.with_values(micro_batch_size=6).one_pass
     roles = fresh(present)
-    assert gather(roles, PROMPTS, 1, 0, 2).said is None
-    monkeypatch.setattr(policy_model, "PASS", 0)  # then every length is worth a group
-    assert gather(roles, PROMPTS, 1, 0, 2, keep=True).said is None
+    assert gather(roles, PROMPTS, 1, 0, 2).first_pass is None
+    monkeypatch.setattr(batching, "PASS", 0)  # then every length is worth a group
+    assert gather(roles, PROMPTS, 1, 0, 2, keep=True).first_pass is None
 
 
 def experienced_again(roles, batch):
@@ -125,7 +127,7 @@ def fresh(present):
 
 def gather_reference(roles, experience):
     lower = roles.trunk.lower(experience.tokens, experience.real)
-    return roles.reference_hidden(experience.tokens, experience.real, lower)
+    return roles.reference.hidden(experience.tokens, experience.real, lower)
 
 
 def test_the_lower_part_and_the_adapter_critic_change_nothing(folder):
@@ -200,7 +202,7 @@ def poison(batch, name):
 
 def test_trimmed_keeps_every_state_that_is_asked_for():
     real = torch.tensor([[0, 0, 1, 1, 1, 0, 0], [0, 1, 1, 1, 1, 1, 0]]).bool()
-    assert trimmed(real, real[:, 4:]) == (1, 5)
+    assert used_columns(real, real[:, 4:]) == (1, 5)
 
 
 def test_rows_of_different_lengths_go_in_groups_of_like_ones():
@@ -217,8 +219,8 @@ def test_groups_change_neither_statistics_nor_gradients(folder, monkeypatch):
     roles, _, _, batch = experienced(settings(folder, critic="separate"))
     found = []
     for most, overhead in ((1, 64), (4, 0)):
-        monkeypatch.setattr(policy_model, "MOST_GROUPS", most)
-        monkeypatch.setattr(policy_model, "PASS", overhead)
+        monkeypatch.setattr(batching, "MOST_GROUPS", most)
+        monkeypatch.setattr(batching, "PASS", overhead)
         groups = len(length_groups(batch.inputs["real"], batch.mask))
         assert (groups > 1) == (most > 1)
         now = PolicyModel(roles)(batch)
@@ -281,7 +283,7 @@ def test_a_sample_that_does_not_count_is_left_out(folder):
 
 
 def test_a_job_that_cannot_fit_is_refused_before_it_is_loaded(folder, monkeypatch):
-    from tightrope.language import roles as module
+    from tightrope.language.policy import roles as module
 
     monkeypatch.setattr(module, "available_memory", lambda device: 1000)
     monkeypatch.setattr(module, "load_causal", lambda *_: pytest.fail("weights were loaded"))

@@ -12,8 +12,7 @@ import pytest
 import torch
 
 from tightrope.algorithms.batch import Batch
-from tightrope.language.rewards import Scores
-from tightrope.language.samples import (
+from tightrope.language.alignment.samples import (
     LONGEST,
     print_comparison,
     print_samples,
@@ -22,6 +21,7 @@ from tightrope.language.samples import (
     shown,
     spread,
 )
+from tightrope.language.reward.functions import Scores
 from tightrope.runs.run import Run
 
 WORDS = ["<pad>", "good", "bad", "film"]

@@ -6,10 +6,11 @@ import pytest
 import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama
 
-from tightrope.language.models import load_causal, without_dropout
-from tightrope.language.sampling import draw, positions, sample
-from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.language.trunk import Trunk
+from tightrope.language.data.batching import positions
+from tightrope.language.generation.distribution import Sampling, token_statistics
+from tightrope.language.generation.sample import draw, sample
+from tightrope.language.model.load import load_causal, without_dropout
+from tightrope.language.model.trunk import Trunk
 
 MODELS = [tiny_llama, tiny_gpt2]
 EOS = (3,)

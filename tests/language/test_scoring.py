@@ -13,11 +13,11 @@ from language.test_reward_model import preferences
 from language.test_roles import PROMPTS, settings
 from language.tiny import saved, tiny_llama, tokenizer
 
-from tightrope.language.answers import RewardError
-from tightrope.language.reward_model import train_reward
-from tightrope.language.rewards import Rewards
-from tightrope.language.scoring import Judge, make_judge, shares_trunk
+from tightrope.language.reward.call import RewardError
+from tightrope.language.reward.functions import Rewards
+from tightrope.language.reward.judge import Judge, make_judge, shares_trunk
 from tightrope.language.settings import RewardSettings
+from tightrope.language.supervised.preferences import train_reward
 
 ASKED = [prompt for prompt in PROMPTS for _ in range(2)]
 

@@ -12,14 +12,18 @@ import torch
 from language.test_data import chatml, random_examples
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
-from tightrope.algorithms.optimise import Brake, NonFiniteError
-from tightrope.language import lora
-from tightrope.language.fitting import Objective, hold_out, load, micro_batches, take_step
-from tightrope.language.models import load_causal, load_tokenizer, parts
-from tightrope.language.packing import collate, pack, row_of
+from tightrope.algorithms.optimise import NonFiniteError, StepGuard
+from tightrope.language.data.batching import collate, pack, row_of
+from tightrope.language.data.examples import hold_out
+from tightrope.language.model import lora
+from tightrope.language.model.load import load_causal, load_tokenizer
+from tightrope.language.model.parts import parts
 from tightrope.language.settings import SFTSettings
-from tightrope.language.sft import hidden_states, mean_loss, token_loss, train_sft
+from tightrope.language.supervised.fit import Objective, micro_batches, take_step
+from tightrope.language.supervised.prepare import load
+from tightrope.language.supervised.sft import hidden_states, mean_loss, token_loss, train_sft
 from tightrope.runs.run import Run
+from tightrope.training.events import Finished, Message, Started, Updated
 
 MODELS = [tiny_llama, tiny_gpt2]
 FACTS = [f"{a} is {b}." for a, b in zip("abcdefgh", "ponmlkji", strict=True)]
@@ -103,7 +107,9 @@ def test_micro_batches_add_up_to_the_minibatch(size):
         model = tiny_llama()
         optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
         settings = settings_of(micro_batch_size=micro, max_grad_norm=None)
-        metrics = take_step(objective_of(model, rows), rows, optimiser, Brake(torch.device("cpu")), settings)
+        metrics = take_step(
+            objective_of(model, rows), rows, optimiser, StepGuard(torch.device("cpu")), settings
+        )
         found.append((metrics, [p.detach() for p in model.parameters()]))
     (whole, wanted), (split, weights) = found
     assert split == pytest.approx(whole, rel=1e-5)
@@ -122,7 +128,7 @@ def test_a_gradient_that_is_not_finite_stops_before_the_step():
     objective = dataclasses.replace(objective_of(model, rows), loss=loss)
     optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
     with pytest.raises(NonFiniteError, match="The loss is nan in this step"):
-        take_step(objective, rows, optimiser, Brake(torch.device("cpu")), settings_of())
+        take_step(objective, rows, optimiser, StepGuard(torch.device("cpu")), settings_of())
     assert all(torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
 
 
@@ -182,7 +188,7 @@ def test_it_learns_facts_and_where_they_end(tmp_path, make, tune):
     settings = settings_of(source, tune=tune, num_epochs=40, held_out=0.0)
     data = [{"prompt": fact[:5], "completion": fact[5:]} for fact in FACTS]
     summary = train_sft(
-        settings, data=data, report=lambda *event: events.append(event), run_dir=tmp_path / "run"
+        settings, data=data, listeners=[lambda event: events.append(event)], run_dir=tmp_path / "run"
     )
 
     model = AutoModelForCausalLM.from_pretrained(tmp_path / "run" / "model")
@@ -196,7 +202,7 @@ def test_it_learns_facts_and_where_they_end(tmp_path, make, tune):
     losses = [row["sft/loss"] for row in Run.open(tmp_path / "run").read_metrics() if "sft/loss" in row]
     assert len(losses) == 80 and losses[-1] < 0.1 < losses[0] / 10
     assert summary["tokens"] == 3 * len(FACTS)
-    assert [kind for kind, _ in events] == ["line", "start", *["update"] * 80, "finish"]
+    assert [type(event) for event in events] == [Message, Started, *[Updated] * 80, Finished]
 
 
 def test_lora_leaves_the_trunk_alone_and_the_merged_model_is_the_adapted_one(tmp_path, folder):
@@ -344,7 +350,7 @@ def test_what_cannot_work_is_said_before_anything_is_written(tmp_path, folder, v
 def test_long_rows_are_reported(tmp_path, folder):
     lines = []
     settings = settings_of(folder, max_tokens=5)
-    train_sft(settings, data=FACTS, run_dir=tmp_path / "run", report=lambda *event: lines.append(event))
-    said = [data["text"] for kind, data in lines if data.get("warning")]
+    train_sft(settings, data=FACTS, run_dir=tmp_path / "run", listeners=[lambda event: lines.append(event)])
+    said = [event.text for event in lines if isinstance(event, Message) and event.level == "warning"]
     cut = "8 of 8 rows have more than max_tokens 5 tokens and were cut"
     assert said == [f"{cut}. Raise max_tokens to keep them whole."]

@@ -10,16 +10,18 @@ import torch
 from language.test_reward_model import preferences
 from language.tiny import saved, tiny_llama, tokenizer
 
-from tightrope.cli import main
-from tightrope.language import fitting
-from tightrope.language.fitting import minibatches
-from tightrope.language.ledger import DoesNotFit, amount, job_of, ledger
-from tightrope.language.reward_model import resume_reward, train_reward
+from tightrope.cli.main import main
+from tightrope.language.memory import DoesNotFit, amount, job_of, ledger
 from tightrope.language.settings import RewardSettings, SFTSettings
-from tightrope.language.sft import resume_sft, train_sft
+from tightrope.language.supervised import fit as fitting
+from tightrope.language.supervised import prepare
+from tightrope.language.supervised.fit import minibatches
+from tightrope.language.supervised.preferences import resume_reward, train_reward
+from tightrope.language.supervised.sft import resume_sft, train_sft
 from tightrope.runs.checkpoint import step_of
-from tightrope.runs.grid import crosses
 from tightrope.runs.run import Run
+from tightrope.training.events import Message, Started, Updated
+from tightrope.training.learner import crosses
 
 FACTS = [f"{a} is {b}." for a, b in zip("abcdefgh", "ponmlkji", strict=True)]
 STAGES = {
@@ -42,8 +44,8 @@ class Cut(Exception):
 def stopping(step: int):
     """A reporter that stops the run after this step."""
 
-    def report(event, data):
-        if event == "update" and data["step"] == step:
+    def report(event):
+        if isinstance(event, Updated) and event.step == step:
             raise Cut
 
     return report
@@ -79,12 +81,12 @@ def test_a_run_that_goes_on_ends_where_one_without_a_break_does(tmp_path, folder
     summary = train(settings, data=data, run_dir=whole)
     assert len(rows_of(whole)) == 10  # 3 minibatches of 6 examples, thrice, and what stands before
     with pytest.raises(Cut):
-        train(settings, data=data, run_dir=broken, report=stopping(min(stop, 9)))
+        train(settings, data=data, run_dir=broken, listeners=[stopping(min(stop, 9))])
     events = []
-    again = resume(broken, data=data, report=lambda event, found: events.append((event, found)))
+    again = resume(broken, data=data, listeners=[lambda event: events.append(event)])
     begin = {2: 0, 8: 5, 11: 5}[stop]
-    assert [found["step"] for event, found in events if event == "start"] == [begin]
-    assert [found["step"] for event, found in events if event == "update"] == list(range(begin + 1, 10))
+    assert [event.step for event in events if isinstance(event, Started)] == [begin]
+    assert [event.step for event in events if isinstance(event, Updated)] == list(range(begin + 1, 10))
     assert rows_of(broken) == rows_of(whole)
     assert again["final"] == summary["final"]
     assert same_end(whole, broken)
@@ -117,7 +119,7 @@ def test_a_finished_run_only_writes_its_model_again(tmp_path, folder, stage):
     train, resume, kind, data = STAGES[stage]
     summary = train(kind(model=folder, held_out=0.25, **FAST), data=data, run_dir=tmp_path / "run")
     before = (tmp_path / "run" / "model" / "model.safetensors").read_bytes()
-    again = resume(tmp_path / "run", data=data, report=stopping(1))
+    again = resume(tmp_path / "run", data=data, listeners=[stopping(1)])
     assert again == summary
     assert (tmp_path / "run" / "model" / "model.safetensors").read_bytes() == before
 
@@ -130,7 +132,9 @@ def test_a_file_is_read_again_and_an_object_is_given_again(tmp_path, folder, sta
         path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     for name, source in (("file", file), ("object", data)):
         with pytest.raises(Cut):
-            train(settings, data=source, validation=data[:2], run_dir=tmp_path / name, report=stopping(5))
+            train(
+                settings, data=source, validation=data[:2], run_dir=tmp_path / name, listeners=[stopping(5)]
+            )
     assert Run.open(tmp_path / "file").settings["data"] == str(file)
     assert Run.open(tmp_path / "object").settings["data"] == "<list>"
     with pytest.raises(
@@ -154,7 +158,7 @@ def test_a_model_in_memory_is_given_again(tmp_path, stage):
     train(settings, data=data, model=(tiny_llama(), tokenizer()), run_dir=tmp_path / "whole")
     with pytest.raises(Cut):
         train(settings, data=data, model=(tiny_llama(), tokenizer()), run_dir=tmp_path / "broken",
-              report=stopping(7))  # fmt: skip
+              listeners=[stopping(7)])  # fmt: skip
     with pytest.raises(ValueError, match="The model of .* was <LlamaForCausalLM>"):
         resume(tmp_path / "broken", data=data)
     resume(tmp_path / "broken", data=data, model=(tiny_llama(), tokenizer()))
@@ -163,7 +167,7 @@ def test_a_model_in_memory_is_given_again(tmp_path, stage):
 
 def test_a_run_of_another_command_is_named(tmp_path, folder):
     train_sft(SFTSettings(model=folder, **FAST), data=FACTS, run_dir=tmp_path / "run")
-    with pytest.raises(ValueError, match="settings that RewardSettings has not: on_completions, pack"):
+    with pytest.raises(ValueError, match="RewardSettings has no setting named 'on_completions'"):
         resume_reward(tmp_path / "run", data=FACTS)
     with pytest.raises(ValueError, match="not a run folder"):
         resume_sft(tmp_path / "absent")
@@ -208,12 +212,16 @@ def test_ctrl_c_says_what_to_type(tmp_path, folder, capsys, monkeypatch):
 def test_memory_is_told_first_and_a_job_that_cannot_fit_loads_nothing(tmp_path, folder, stage, monkeypatch):
     train, _, kind, data = STAGES[stage]
     settings, events = kind(model=folder, tune="full", **FAST), []
-    train(settings, data=data, run_dir=tmp_path / "run", report=lambda *event: events.append(event))
-    said = next(found["text"] for event, found in events if event == "line")
-    assert events[0][0] == "line" and "model: Adam's two moments" in said and "memory at the peak" in said
+    train(settings, data=data, run_dir=tmp_path / "run", listeners=[lambda event: events.append(event)])
+    said = next(event.text for event in events if isinstance(event, Message))
+    assert (
+        isinstance(events[0], Message)
+        and "model: Adam's two moments" in said
+        and "memory at the peak" in said
+    )
     loaded = []
-    monkeypatch.setattr(fitting, "available_memory", lambda device: 1000)
-    monkeypatch.setattr(fitting, "load_causal", lambda *arguments: loaded.append(arguments))
+    monkeypatch.setattr(prepare, "available_memory", lambda device: 1000)
+    monkeypatch.setattr(prepare, "load_causal", lambda *arguments: loaded.append(arguments))
     with pytest.raises(DoesNotFit, match="--gradient-checkpointing"):
         train(settings, data=data, run_dir=tmp_path / "other")
     assert not loaded and not (tmp_path / "other").exists()
@@ -225,8 +233,8 @@ def test_a_model_that_is_given_counts_by_its_config_and_is_there_already(tmp_pat
     model, settings = tiny_llama(), kind(tune="full", **FAST)
     need = ledger(model.config, job_of(settings)).total
     there = sum(parameter.nbytes for parameter in model.parameters())
-    monkeypatch.setattr(fitting, "available_memory", lambda device: int(need / 0.9) - there - 100)
+    monkeypatch.setattr(prepare, "available_memory", lambda device: int(need / 0.9) - there - 100)
     with pytest.raises(DoesNotFit, match=f"needs about {amount(need)}"):
         train(settings, data=data, model=(model, tokenizer()), run_dir=tmp_path / "run")
-    monkeypatch.setattr(fitting, "available_memory", lambda device: int(need / 0.9) - there + 100)
+    monkeypatch.setattr(prepare, "available_memory", lambda device: int(need / 0.9) - there + 100)
     train(settings, data=data, model=(model, tokenizer()), run_dir=tmp_path / "run")

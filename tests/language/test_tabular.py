@@ -10,7 +10,7 @@ from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
 from tightrope.algorithms.settings import PPOSettings
-from tightrope.language.kl import kl_loss, kl_rewards, shared_scale
+from tightrope.language.alignment.kl import kl_loss, kl_rewards, shared_scale
 
 LANGUAGE = Language(words=4, length=2)
 KL_BETA = 0.5

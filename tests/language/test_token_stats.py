@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from tightrope.language import token_stats
-from tightrope.language.token_stats import Sampling, shape_logits, token_statistics
+from tightrope.language.generation import distribution
+from tightrope.language.generation.distribution import Sampling, shape_logits, token_statistics
 from tightrope.maths.divergence import categorical_entropy
 
 N, D, V = 11, 6, 17
@@ -36,7 +36,7 @@ def plainly(head, hidden, reference, tokens, sampling, support):
     [(Sampling(), 0), (Sampling(0.7), 0), (Sampling(1.3, forbidden=(0, 1)), 0), (Sampling(0.9), 5)],
 )
 def test_values_and_gradients(monkeypatch, bias, chunk, sampling, top):
-    monkeypatch.setattr(token_stats, "CHUNK", chunk)
+    monkeypatch.setattr(distribution, "CHUNK", chunk)
     head, hidden, reference, tokens = numbers(bias, torch.float32)
     support = None
     if top:
@@ -60,7 +60,7 @@ def test_values_and_gradients(monkeypatch, bias, chunk, sampling, top):
 @pytest.mark.parametrize("top", [0, 5])
 def test_the_entropy_is_that_of_the_maths(monkeypatch, sampling, top):
     """Value and gradient, chunked, in the very logits that the sampler shapes."""
-    monkeypatch.setattr(token_stats, "CHUNK", 3 * V)
+    monkeypatch.setattr(distribution, "CHUNK", 3 * V)
     head, hidden, _, tokens = numbers(True, torch.float32)
     support = None
     if top:
@@ -86,7 +86,7 @@ def test_the_head_gets_its_gradient_when_it_is_trained():
 
 @pytest.mark.parametrize("top", [0, 5])
 def test_a_gradient_computed_ahead_is_the_one_computed_later(monkeypatch, top):
-    monkeypatch.setattr(token_stats, "CHUNK", 3 * V)
+    monkeypatch.setattr(distribution, "CHUNK", 3 * V)
     head, hidden, reference, tokens = numbers(True, torch.float32)
     head.requires_grad_(False)
     sampling, support = Sampling(0.8, forbidden=(0, 1)), None

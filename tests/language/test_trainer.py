@@ -10,18 +10,18 @@ from language.tiny import saved, tiny_llama
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.memory import OutOfMemory
-from tightrope.language import lora
-from tightrope.language.alignment import align
-from tightrope.language.answers import RewardError
-from tightrope.language.collect import gather
-from tightrope.language.data import Prompt
-from tightrope.language.kl import KL_FORMS, AdaptiveKL
-from tightrope.language.policy_model import PolicyModel
-from tightrope.language.ptx import Pretraining
-from tightrope.language.reward_model import train_reward
+from tightrope.language.alignment.align import align
+from tightrope.language.alignment.experience import gather
+from tightrope.language.alignment.iteration import Trainer, hold_out_prompts
+from tightrope.language.alignment.kl import KL_FORMS, AdaptiveKL
+from tightrope.language.alignment.ptx import Pretraining
+from tightrope.language.data.examples import Prompt
+from tightrope.language.model import lora
+from tightrope.language.policy.policy_model import PolicyModel
+from tightrope.language.reward.call import RewardError
 from tightrope.language.settings import AlignSettings, RewardSettings
-from tightrope.language.trainer import Trainer, hold_out
-from tightrope.runs.report import silent
+from tightrope.language.supervised.preferences import train_reward
+from tightrope.training.events import Listeners
 
 PROMPTS = ["ab", "cde", "f", "ghij"]
 
@@ -48,7 +48,7 @@ def trainer(folder, reward=letters, **values):
         "learning_rate": 1e-2, "seed": 1,
     }  # fmt: skip
     settings = AlignSettings(model=folder).with_values(**{**usual, **values})
-    return Trainer(settings, PROMPTS, reward, None, silent)
+    return Trainer(settings, PROMPTS, reward, None, Listeners())
 
 
 def shaken(made):
@@ -65,17 +65,17 @@ def test_where_nothing_is_to_be_earned_the_kl_leads_back_to_the_reference(folder
     made = shaken(
         trainer(folder, nothing, kl=form, kl_beta=1.0, total_episodes=320, batch_size=64, learning_rate=3e-3)
     )
-    found = [metrics["objective/kl_exact"] for metrics, _ in made.iterate()]
+    found = [metrics["objective/kl_exact"] for metrics in (update.metrics for update in made.iterate())]
     assert found[0] > 0.2 and found[-1] < 0.7 * found[0], found
 
 
 def test_kl_beta_follows_the_kl_of_whole_responses_once_a_rollout(folder):
     """The goal lies beside the KL, so that the error is not clipped and its size tells what was fed."""
     still = {"total_episodes": 64, "learning_rate": 1e-6, "kl_beta": 0.2, "kl_horizon": 100.0}
-    first, _ = next(shaken(trainer(folder, **still)).iterate())
+    first = next(shaken(trainer(folder, **still)).iterate()).metrics
     goal = 0.95 * first["objective/kl"]
     made, control = shaken(trainer(folder, kl_goal=goal, **still)), AdaptiveKL(0.2, goal, horizon=100.0)
-    for metrics, _ in made.iterate():
+    for metrics in (update.metrics for update in made.iterate()):
         assert metrics["objective/kl_beta"] == pytest.approx(control.kl_beta)
         control = control.next(metrics["objective/kl"], 16)
         assert made.kl_beta == pytest.approx(control.kl_beta) and made.kl_beta != 0.2
@@ -97,7 +97,7 @@ def test_micro_batches_change_no_metric(folder, form):
     found = []
     for micro in (None, 3):
         made = shaken(trainer(folder, micro_batch_size=micro, **values))
-        ((metrics, _),) = made.iterate()
+        metrics = next(made.iterate()).metrics
         found.append({name: x for name, x in metrics.items() if name[:5] != "time/"})
     assert found[0] == pytest.approx(found[1], rel=1e-2, abs=1e-4)
     assert found[0]["train/kl_loss"] > 0.05
@@ -108,11 +108,13 @@ def test_the_pass_that_the_rollout_keeps_changes_no_metric(folder, monkeypatch):
     values = {"minibatch_size": 16, "num_epochs": 2, "total_episodes": 48, "critic_warmup": 1}
     taken, found = [], []
     init = PolicyModel.__init__
-    counted = lambda *a, said=None, **k: taken.append(said is not None) or init(*a, said=said, **k)  # noqa: E731
+    counted = lambda *a, first_pass=None, **k: (  # noqa: E731
+        taken.append(first_pass is not None) or init(*a, first_pass=first_pass, **k)
+    )
     monkeypatch.setattr(PolicyModel, "__init__", counted)
     for micro in (None, 16):
         made = shaken(trainer(folder, micro_batch_size=micro, **values))
-        rows = [metrics for metrics, _ in made.iterate()]
+        rows = [update.metrics for update in made.iterate()]
         found.append([{name: x for name, x in row.items() if name[:5] != "time/"} for row in rows])
     assert taken == [False, True, True, False, False, False]  # never while the critic alone warms up
     for kept, own in zip(*found, strict=True):
@@ -136,7 +138,7 @@ def test_the_pretraining_loss_adds_up_over_micro_batches(folder, tmp_path, micro
                 torch.cat([p.grad.flatten() for p in made.roles.parameters() if p.grad is not None])
             )
         )
-        booked.append(next(made.iterate())[0]["train/ptx_loss"])
+        booked.append(next(made.iterate()).metrics["train/ptx_loss"])
         found.append(gradients[0])
     assert float((found[0] - found[1]).norm()) <= 1e-4 * float(found[0].norm())
     assert booked[1] == pytest.approx(booked[0], rel=1e-5)
@@ -165,7 +167,7 @@ def test_a_pass_that_memory_ends_is_repeated_with_the_same_pretraining_texts(fol
                 torch.cat([p.grad.flatten() for p in made.roles.parameters() if p.grad is not None])
             )
         )
-        metrics, _ = next(made.iterate())
+        metrics = next(made.iterate()).metrics
         assert not left and ("train/memory_halvings" in metrics) == fails
         found.append((torch.cat(learnt), gradients, made.pretraining.rng.bit_generator.state))
     (plain, steps, state), (again, steps_again, state_again) = found
@@ -178,7 +180,7 @@ def test_a_pass_that_memory_ends_is_repeated_with_the_same_pretraining_texts(fol
 def test_whitening_leaves_the_reward_metrics_in_units_of_the_score(folder):
     """Without a score all of the reward is the KL's; whitened, one was divided and the other not."""
     made = shaken(trainer(folder, reward=nothing, whiten_rewards=True, kl_beta=0.5))
-    metrics, _ = next(made.iterate())
+    metrics = next(made.iterate()).metrics
     assert made.reward_scale != 1.0
     share = metrics["objective/non_score_reward"]
     assert share == pytest.approx(-0.5 * metrics["objective/kl"], rel=1e-5)
@@ -187,11 +189,11 @@ def test_whitening_leaves_the_reward_metrics_in_units_of_the_score(folder):
 
 def test_held_out_prompts_are_never_trained_on_not_even_twins():
     prompts = [Prompt((k % 9,), str(k), {}) for k in range(30)]
-    kept, held = hold_out(prompts, 2)
+    kept, held = hold_out_prompts(prompts, 2)
     assert len(held) == 2 and not {p.tokens for p in held} & {p.tokens for p in kept}
-    assert len(hold_out(prompts, 100)[1]) == 2  # a quarter of nine different ones
+    assert len(hold_out_prompts(prompts, 100)[1]) == 2  # a quarter of nine different ones
     with pytest.raises(ValueError, match="3 different prompts"):
-        hold_out(prompts[:3] * 4, 1)
+        hold_out_prompts(prompts[:3] * 4, 1)
 
 
 def test_the_settings_of_the_update_reach_the_update(folder, monkeypatch):
@@ -208,7 +210,7 @@ def test_the_settings_of_the_update_reach_the_update(folder, monkeypatch):
 
     monkeypatch.setattr(ppo, "update", spy)
     made = trainer(folder, total_episodes=16, **values)
-    ((_, _),) = made.iterate()
+    (_,) = made.iterate()
     ((settings, optimiser),) = seen
     assert {name: getattr(settings, name) for name in values} == values and settings.gamma == 1.0
     assert [group["lr"] for group in optimiser.param_groups] == [1e-2, 1e-3]
@@ -243,14 +245,16 @@ def test_a_head_on_the_policy_cannot_be_made_of_a_reward_model(folder, tmp_path)
 
 def test_held_out_prompts_are_answered_as_many_at_a_time_as_a_batch_has(folder, monkeypatch):
     """The memory ledger counts on it."""
-    from tightrope.language import trainer as module
+    from tightrope.language.alignment import iteration as module
 
     sizes, real = [], module.respond
     monkeypatch.setattr(module, "respond", lambda roles, prompts, *more: (
         sizes.append(len(prompts)), real(roles, prompts, *more))[1])  # fmt: skip
     settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, held_out_prompts=10)
-    made = Trainer(settings, [chr(97 + k % 26) * (1 + k // 26) for k in range(44)], letters, letters, silent)
-    found = made.evaluate()
+    made = Trainer(
+        settings, [chr(97 + k % 26) * (1 + k // 26) for k in range(44)], letters, letters, Listeners()
+    )
+    found = made.gold_scores()
     assert sizes == [4, 4, 2] and len(made.held_out) == 10 and 0 <= found["eval/gold"] <= 1
 
 
@@ -259,20 +263,19 @@ def test_what_the_gold_judge_fails_to_score_is_told_and_counted(folder):
     lines, prompts = [], [chr(97 + k % 26) * (1 + k // 26) for k in range(40)]
     settings = AlignSettings(model=folder, batch_size=8, max_new_tokens=3, held_out_prompts=8)
 
-    def report(_, event):
-        lines.append(event.get("text", ""))
+    report = Listeners([lambda event: lines.append(str(event))])
 
     def choosy(completions, **_):
         return [math.nan if k % 4 == 0 else 1.0 for k in range(len(completions))]
 
     made = Trainer(settings, prompts, letters, choosy, report)
     for _ in range(2):
-        assert made.evaluate() == {"eval/gold": 1.0, "eval/gold_masked": 2.0}
+        assert made.gold_scores() == {"eval/gold": 1.0, "eval/gold_masked": 2.0}
     assert sum("gold judge" in line and "choosy" in line for line in lines) == 1
     made = Trainer(settings, prompts, letters, lambda completions, **_: [None] * len(completions), report)
     with pytest.raises(RewardError, match="^The gold judge: Not one response"):
         for _ in range(3):
-            made.evaluate()
+            made.gold_scores()
 
 
 def test_a_run_without_one_step_says_so(folder, tmp_path):
@@ -280,7 +283,7 @@ def test_a_run_without_one_step_says_so(folder, tmp_path):
     run = align(
         model=folder, prompts=["ab", "cd"], reward=lambda completions, **_: [None] * len(completions),
         total_episodes=8, batch_size=4, max_new_tokens=3, run_dir=tmp_path / "run",
-        report=lambda _, event: lines.append(event.get("text", "")),
+        listeners=[lambda event: lines.append(str(event))],
     )  # fmt: skip
     assert len(run.metrics) == 2 and any("not one step was taken" in line for line in lines)
 
@@ -301,9 +304,9 @@ def test_memory_that_is_short_for_scoring_names_the_setting(folder, monkeypatch)
 
 def test_memory_that_is_short_for_a_kept_pass_is_told_once(folder, monkeypatch):
     """From then on no pass is kept: the size says so, and lies in the checkpoint."""
-    from tightrope.language import collect
+    from tightrope.language.alignment import experience as collect
 
-    lines, looks, whole = [], [], collect._look
+    lines, looks, whole = [], [], collect._evaluate
 
     def short(*args):
         looks.append(torch.is_grad_enabled())
@@ -311,21 +314,21 @@ def test_memory_that_is_short_for_a_kept_pass_is_told_once(folder, monkeypatch):
             raise torch.OutOfMemoryError("CUDA")
         return whole(*args)
 
-    monkeypatch.setattr(collect, "_look", short)
+    monkeypatch.setattr(collect, "_evaluate", short)
     made = trainer(folder, minibatch_size=16, total_episodes=48)
-    made.report = lambda _, event: lines.append(event.get("text", ""))
+    made.listeners.add(lambda event: lines.append(getattr(event, "text", "")))
     assert len(list(made.iterate())) == 3 and looks == [True, False, False, False]
     assert made.micro_batch_size == 16 and sum("memory ran out" in line for line in lines) == 1
 
 
-def test_the_clock_of_a_run_leaves_evaluations_out(folder):
+def test_the_clock_of_a_run_leaves_evaluations_out(folder, tmp_path):
     def slow(completions, **_):
         time.sleep(0.3)
         return [0.0] * len(completions)
 
-    settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, total_episodes=8)
-    made = Trainer(settings, list("abcdefgh"), letters, slow, silent)
+    settings = AlignSettings(model=folder, batch_size=4, max_new_tokens=3, total_episodes=4)
     begin = time.perf_counter()
-    metrics, _ = next(made.iterate())
+    run = align(settings, prompts=list("abcdefgh"), reward=letters, gold=slow, run_dir=tmp_path / "run")
+    [metrics] = run.metrics
     assert "eval/gold" in metrics and metrics["time/seconds"] <= time.perf_counter() - begin - 0.3
     assert metrics["time/update_seconds"] < metrics["time/seconds"]

@@ -4,8 +4,8 @@ import pytest
 import torch
 from language.tiny import padded, tiny_gpt2, tiny_llama
 
-from tightrope.language import lora
-from tightrope.language.trunk import Trunk
+from tightrope.language.model import lora
+from tightrope.language.model.trunk import Trunk
 
 MODELS = [tiny_llama, tiny_gpt2]
 

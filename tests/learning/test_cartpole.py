@@ -5,7 +5,7 @@ import json
 import pytest
 
 import tightrope
-from tightrope.cli import main
+from tightrope.cli.main import main
 from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 import tightrope
-from tightrope.cli import main
+from tightrope.cli.main import main
 from tightrope.control import train
 from tightrope.control.evaluate import evaluate_run
 from tightrope.runs import checkpoint
@@ -135,7 +135,7 @@ def evaluated(name: str) -> Outcome:
 
 def log_probabilities(folder: Path) -> list[list[float]]:
     """log p of each token of TEXTS under a model folder, read as transformers reads it."""
-    from tightrope.language.models import load_causal, load_tokenizer
+    from tightrope.language.model.load import load_causal, load_tokenizer
 
     model, tokenizer, found = load_causal(str(folder)), load_tokenizer(str(folder)), []
     for text in TEXTS:
@@ -153,8 +153,8 @@ def used_sft(name: str) -> Outcome:
 
 def used_reward(name: str) -> Outcome:
     """The scores of a finished reward model."""
-    from tightrope.language.models import load_tokenizer
-    from tightrope.language.reward_model import load_reward
+    from tightrope.language.model.load import load_tokenizer
+    from tightrope.language.reward.model import load_reward
 
     model, tokenizer = load_reward(name), load_tokenizer(str(Path(name) / "model"))
     scores = []
@@ -166,7 +166,7 @@ def used_reward(name: str) -> Outcome:
 
 def used_align(name: str) -> Outcome:
     """What ``tightrope sample`` says of a finished run, and the aligned model's probabilities."""
-    from tightrope.language.evaluate import sample_run
+    from tightrope.language.compare import sample_run
 
     return outcome({"samples": sample_run(name, count=3), "log p": log_probabilities(Path(name) / "model")})
 

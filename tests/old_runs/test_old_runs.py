@@ -30,7 +30,7 @@ from old_runs.comparison import ABSOLUTE, RELATIVE, SHOWN, How, differences, how
 from old_runs.outcomes import ASKED, ENVIRONMENTS
 from safetensors.torch import load_file
 
-from tightrope.cli import main
+from tightrope.cli.main import main
 from tightrope.runs import checkpoint
 
 HERE = Path(__file__).parent

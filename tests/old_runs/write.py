@@ -41,10 +41,11 @@ from safetensors.torch import save_file
 import tightrope
 from tightrope.control.resolve import resolve
 from tightrope.control.train import train
-from tightrope.language.alignment import align
-from tightrope.language.reward_model import train_reward
+from tightrope.language.alignment.align import align
 from tightrope.language.settings import RewardSettings, SFTSettings
-from tightrope.language.sft import train_sft
+from tightrope.language.supervised.preferences import train_reward
+from tightrope.language.supervised.sft import train_sft
+from tightrope.training.events import Event, Updated
 
 SHORT = {"num_envs": 4, "hidden": (8,), "seed": 3, "threads": 1, "evaluation_episodes": 2}
 CONTROL: dict[str, tuple[Any, str, dict[str, Any], int]] = {  # environment, algorithm, settings, killed at
@@ -139,11 +140,11 @@ def write_data() -> None:
 def die_at(name: str, run: str, at: int) -> None:
     """Train, and leave this process at a step as SIGKILL would."""
 
-    def report(event: str, data: dict[str, Any]) -> None:
-        if event == "update" and data["step"] >= at:
+    def listen(event: Event) -> None:
+        if isinstance(event, Updated) and event.step >= at:
             os._exit(9)
 
-    stories()[name](run_dir=run, report=report)
+    stories()[name](run_dir=run, listeners=[listen])
     raise AssertionError(f"{name} came to its end before {at}")
 
 

@@ -14,7 +14,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from tightrope.control.faults import EnvironmentFault
+from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.runs import checkpoint, history, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY, CannotWrite, remove_leftovers, writing

@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from tightrope.runs.language_metrics import LANGUAGE_TABLE
-from tightrope.runs.metrics import _TABLE, FAMILIES, METRICS, check_names, of_story
+from tightrope.metrics.language import LANGUAGE_TABLE
+from tightrope.metrics.table import _TABLE, FAMILIES, METRICS, check_names, of_story
 
 KNOWN_TO_USERS = [
     "rollout/ep_rew_mean",
@@ -95,7 +95,7 @@ def test_a_metric_that_is_never_logged_is_not_declared() -> None:
 
 
 def test_the_tolerance_of_language_is_told_where_ratios_are_watched() -> None:
-    from tightrope.language.sampling import LOG_RATIO_LIMIT
+    from tightrope.language.generation.sample import LOG_RATIO_LIMIT
 
     assert f"language: up to {LOG_RATIO_LIMIT:g}" in METRICS["train/log_ratio_first"].doc
 

@@ -24,11 +24,12 @@ from tightrope.control.evaluate import evaluate_run
 from tightrope.control.record import record_run
 from tightrope.control.settings import TrainSettings
 from tightrope.control.train import resume, train
-from tightrope.language.alignment import align, resume_align
-from tightrope.language.evaluate import sample_run
-from tightrope.language.reward_model import resume_reward, train_reward
+from tightrope.language.alignment.align import align, resume_align
+from tightrope.language.compare import sample_run
 from tightrope.language.settings import RewardSettings, SFTSettings
-from tightrope.language.sft import resume_sft, train_sft
+from tightrope.language.supervised.preferences import resume_reward, train_reward
+from tightrope.language.supervised.sft import resume_sft, train_sft
+from tightrope.training.events import Event, Updated
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM, signal.SIGVTALRM, signal.SIGUSR1, signal.SIGUSR2)
 
@@ -76,8 +77,8 @@ class Enough(Exception):
     """What ends a run in the middle."""
 
 
-def stopping(event: str, data: dict[str, Any]) -> None:
-    if event == "update":
+def stopping(event: Event) -> None:
+    if isinstance(event, Updated):
         raise Enough
 
 
@@ -104,9 +105,9 @@ def control(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_control(tmp_path: Path, control: Path, engine: str) -> None:
     run = tmp_path / "run"
     with unchanged(), pytest.raises(Enough):
-        train(CONTROL.with_values(engine=engine), run_dir=run, report=stopping)
+        train(CONTROL.with_values(engine=engine), run_dir=run, listeners=[stopping])
     with unchanged(), pytest.raises(Enough):
-        resume(run, report=stopping)
+        resume(run, listeners=[stopping])
     with unchanged():
         resume(run)
     with unchanged(), pytest.raises(ValueError, match="num_envs"):
@@ -153,9 +154,9 @@ def test_alignment(model: str, tmp_path: Path) -> None:
     align(run_dir=tmp_path / "first", **given, **values)
     run = tmp_path / "run"
     with unchanged(), pytest.raises(Enough):
-        align(run_dir=run, report=stopping, **given, **values)
+        align(run_dir=run, listeners=[stopping], **given, **values)
     with unchanged(), pytest.raises(Enough):
-        resume_align(run, report=stopping, **given)
+        resume_align(run, listeners=[stopping], **given)
     with unchanged():
         resume_align(run, **given)
     with unchanged(), pytest.raises(ValueError, match="no rows"):
@@ -177,7 +178,7 @@ def test_supervised(model: str, tmp_path: Path, stage: str) -> None:
     first(settings, data=data, run_dir=tmp_path / "first")
     run = tmp_path / "run"
     with unchanged(), pytest.raises(Enough):
-        first(settings, data=data, run_dir=run, report=stopping)
+        first(settings, data=data, run_dir=run, listeners=[stopping])
     with unchanged():
         again(run, data=data)
     with unchanged(), pytest.raises(ValueError, match="was <list>"):

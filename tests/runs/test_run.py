@@ -13,6 +13,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tightrope.control.settings import TrainSettings
+from tightrope.control.train import train
 from tightrope.runs import checkpoint
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY
@@ -20,6 +22,8 @@ from tightrope.runs.lock import WriterLock
 from tightrope.runs.records import dumps, plain, read_json, read_lines, write_json
 from tightrope.runs.run import Run
 from tightrope.runs.signed import signed
+from tightrope.training.events import Started, Updated
+from tightrope.training.tensorboard import TensorBoard
 
 SETTINGS = {"env": "CartPole-v1", "hidden": (64, 64), "clip": 0.2}
 
@@ -257,10 +261,11 @@ def test_tensorboard_files_hold_the_scalars(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    with Run.create(tmp_path / "a", SETTINGS, "name", tensorboard=True) as run:
-        run.record(100, 1.0, {"train/entropy": -0.5, "train/approx_kl": float("nan")})
-        events = EventAccumulator(str(run.path / "tensorboard"))
-        events.Reload()
+    listener = TensorBoard()
+    listener(Started(str(tmp_path), {}, 0, 200, ()))
+    listener(Updated(100, 200, 1.0, {"train/entropy": -0.5, "train/approx_kl": float("nan")}))
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
     assert events.Tags()["scalars"] == ["train/entropy"]
     assert [(e.step, e.value) for e in events.Scalars("train/entropy")] == [(100, -0.5)]
 
@@ -268,7 +273,7 @@ def test_tensorboard_files_hold_the_scalars(tmp_path: Path) -> None:
 def test_tensorboard_without_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(ValueError, match=r"pip install 'tightrope\[tensorboard\]'"):
-        Run.create(tmp_path / "a", SETTINGS, "name", tensorboard=True)
+        train(TrainSettings(env="CartPole-v1", tensorboard=True), run_dir=tmp_path / "a")
     assert list(tmp_path.iterdir()) == []
 
 

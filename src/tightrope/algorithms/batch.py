@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -20,9 +20,10 @@ class Evaluation:
     entropy: Tensor
     values: Tensor
 
-    def within(self, mask: Tensor) -> Evaluation:
-        """The same with 0 outside the mask: what a model says of padding reaches no loss and no gradient."""
-        return Evaluation(*(torch.where(mask, x, 0.0) for x in (self.logp, self.entropy, self.values)))
+    def within(self, mask: Tensor) -> Self:
+        """The same with 0 outside the mask: what a model computes for padding reaches no gradient."""
+        figures = {name: torch.where(mask, x, 0.0) for name, x in vars(self).items()}
+        return dataclasses.replace(self, **figures)  # a subclass keeps its own figures
 
 
 @dataclass(frozen=True)

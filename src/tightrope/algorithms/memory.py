@@ -59,13 +59,13 @@ class Parts:
     ) -> Any:
         """The sum of ``one(part)``, which adds a part's gradient, over all parts of a minibatch.
 
-        When memory runs out the gradient and the books of the meter go back, and everything is done again in
+        When memory runs out the gradient and the sums of the meter are put back, and the pass is repeated in
         parts of half the size; OutOfMemory when a part is a single row.
         """
-        books = meter.books()
+        before = meter.snapshot()
 
         def attempt(size: int | None) -> Any:
-            meter.restore(books)
+            meter.restore(before)
             optimiser.zero_grad(set_to_none=True)
             return sum(one(part) for part in minibatch.split(size))
 

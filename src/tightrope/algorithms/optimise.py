@@ -1,4 +1,4 @@
-"""What all update rules do alike: build Adam, take a checked step, and keep the books over every
+"""What all update rules do alike: build Adam, take a checked step, and keep sums over every
 minibatch.
 """
 
@@ -117,13 +117,13 @@ class Meter:
         x = x.max() if largest else x.min()
         self._extremes[key] = pick(self._extremes[key], x) if key in self._extremes else x
 
-    def books(self) -> tuple[dict[str, Any], ...]:
+    def snapshot(self) -> tuple[dict[str, Any], ...]:
         """All sums as they stand, to go back to with `restore`."""
         return tuple(dict(x) for x in (self._sums, self._counts, self._extremes))
 
-    def restore(self, books: tuple[dict[str, Any], ...]) -> None:
-        """Forget what was added since ``books`` were taken."""
-        self._sums, self._counts, self._extremes = (dict(x) for x in books)
+    def restore(self, snapshot: tuple[dict[str, Any], ...]) -> None:
+        """Forget what was added since ``snapshot`` was taken."""
+        self._sums, self._counts, self._extremes = (dict(x) for x in snapshot)
 
     def means(self) -> dict[str, float]:
         """One read of the device: the mean of every sum, and the extremes."""
@@ -133,8 +133,8 @@ class Meter:
         return dict(zip(names, torch.stack(values).tolist(), strict=True)) if names else {}
 
 
-def book_ratios(meter: Meter, log_ratio: Tensor, mask: Tensor, clip: float, clip_high: float) -> Tensor:
-    """Book what the ratios tell of the step size; returns the sum of k3 over the counting steps."""
+def record_ratios(meter: Meter, log_ratio: Tensor, mask: Tensor, clip: float, clip_high: float) -> Tensor:
+    """Record how far the ratios are from 1; returns the sum of k3 over the counting steps."""
     high = surrogate.clipped_high(log_ratio, clip_high) & mask
     low = surrogate.clipped_low(log_ratio, clip) & mask
     kl = divergence.k3(log_ratio).detach()
@@ -146,31 +146,38 @@ def book_ratios(meter: Meter, log_ratio: Tensor, mask: Tensor, clip: float, clip
     return statistics.masked_sum(kl, mask)
 
 
-class Brake:
-    """Decides on the device, before a step, whether it may be taken; once on, it stays on.
+class StepGuard:
+    """Decides on the device, before a step, whether it may be taken. A step that is refused ends the update.
 
-    ``kl``: the minibatch's KL is above target_kl.  ``bad``: the gradient norm is not finite.  A fused Adam
-    skips the step by itself (its ``found_inf``), so an accelerator need not be waited for; the host looks
-    when it polls.
+    A fused Adam skips a refused step by itself (its ``found_inf``), so an accelerator need not be waited for;
+    the host reads the decision when it polls.
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.kl = torch.zeros((), dtype=torch.bool, device=device)
-        self.bad = torch.zeros((), dtype=torch.bool, device=device)
+        self._stopped = torch.zeros((), dtype=torch.bool, device=device)
+        self._bad = torch.zeros((), dtype=torch.bool, device=device)
         self.steps = torch.zeros((), dtype=torch.int64, device=device)
         self._lazy = device.type == "cuda"
 
+    def refuse(self, bad: Tensor) -> None:
+        """Refuse the step when ``bad``, a bool on the device, is True: the loss is not finite."""
+        self._bad = self._bad | bad
+
+    def stop(self, enough: Tensor) -> None:
+        """Stop before the step when ``enough``, a bool on the device, is True: the KL is above its limit."""
+        self._stopped = self._stopped | enough
+
     def step(self, optimiser: torch.optim.Optimizer, max_grad_norm: float | None, meter: Meter) -> None:
-        """Clip by one joint norm over all parameters and take the step, unless the brake is on."""
+        """Clip by one joint norm over all parameters and take the step, unless it is refused."""
         parameters = [p for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
         norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
         # infinite weights too: behind a saturated unit their gradient is 0
         largest = nn.utils.get_total_norm([p.detach() for p in parameters], norm_type=math.inf)
-        self.bad = self.bad | ~(torch.isfinite(norm) & torch.isfinite(largest))
+        self._bad = self._bad | ~(torch.isfinite(norm) & torch.isfinite(largest))
         if max_grad_norm is not None:
-            scale = torch.where(self.bad, 0.0, norm)  # 0: a bad gradient stays as it is, to be looked at
+            scale = torch.where(self._bad, 0.0, norm)  # 0: a bad gradient stays as it is, to be explained
             nn.utils.clip_grads_with_norm_(parameters, max_grad_norm, scale)
-        halted = self.kl | self.bad
+        halted = self._stopped | self._bad
         self.steps += ~halted
         fused = all(group.get("fused") for group in optimiser.param_groups)
         if self._lazy and fused:
@@ -181,14 +188,15 @@ class Brake:
         meter.add_sum("grad_norm", norm.detach(), 1.0)
 
     def halted(self, explain: Callable[[], str] | None = None, *, poll: bool = False) -> bool:
-        """Whether to stop; raises NonFiniteError for a bad gradient, with what ``explain`` says of it. Waits
-        for an accelerator only when polled.
+        """Whether to stop; raises NonFiniteError for a bad gradient, with the text of ``explain``.
+
+        Waits for an accelerator only when polled.
         """
         if self._lazy and not poll:
             return False
-        if bool(self.bad):
+        if bool(self._bad):
             raise NonFiniteError(explain() if explain else f"The gradient holds a NaN; {REFUSED}")
-        return bool(self.kl)
+        return bool(self._stopped)
 
 
 def check_first_ratios(log_ratio: Tensor, limit: float | None) -> None:

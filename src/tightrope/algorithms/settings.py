@@ -1,114 +1,18 @@
-"""The settings of the update rules: frozen data, checked where they are made, imported without torch.
-
-Each field carries its own one-line help and its range; the command line, the validation and the docs read
-them here.
-"""
+"""The settings of the update rules; imported without torch."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-import math
 from dataclasses import dataclass
-from typing import Any, Literal, Self, get_args, get_type_hints
+from typing import Any, Self
 
-Schedule = Literal["constant", "linear", "cosine"]
-
-
-def setting(
-    default: Any,
-    doc: str,
-    *,
-    at_least: float | None = None,
-    at_most: float | None = None,
-    above: float | None = None,
-    choices: tuple[str, ...] | None = None,
-) -> Any:
-    """A dataclass field with its help text and its range.
-
-    ``at_least`` and ``at_most`` are inclusive, ``above`` is exclusive, ``choices`` lists the words allowed.
-    A default of None means the setting is optional and ``none`` on the command line switches it off.
-    """
-    metadata = {"doc": doc, "at_least": at_least, "at_most": at_most, "above": above, "choices": choices}
-    return dataclasses.field(default=default, metadata=metadata)
-
-
-def range_text(metadata: Any) -> str:
-    """The range of a field in words: ``0 < x <= 1``, ``a | b``, or an empty string when anything goes."""
-    if metadata.get("choices"):
-        return " | ".join(metadata["choices"])
-    low = (
-        f"{metadata['above']:g} < "
-        if metadata.get("above") is not None
-        else f"{metadata['at_least']:g} <= "
-        if metadata.get("at_least") is not None
-        else ""
-    )
-    high = f" <= {metadata['at_most']:g}" if metadata.get("at_most") is not None else ""
-    return f"{low}x{high}" if low or high else ""
-
-
-def check_types(settings: Any) -> None:
-    """Raise ValueError for a value of the wrong kind; a whole number is taken for a float, a list for a
-    tuple.
-    """
-    for name, hint in get_type_hints(type(settings)).items():
-        if name not in getattr(settings, "__dataclass_fields__", {}):
-            continue
-        value, kinds = getattr(settings, name), set(get_args(hint)) | {hint}
-        words = str(hint).replace("typing.", "").removeprefix("<class '").removesuffix("'>")
-        if value is None:
-            good = type(None) in kinds
-        elif float in kinds and isinstance(value, int) and not isinstance(value, bool):
-            object.__setattr__(settings, name, float(value))
-            good = True
-        elif "tuple" in words:
-            good = isinstance(value, list | tuple) and all(type(x) is int for x in value)
-            object.__setattr__(settings, name, tuple(value) if good else value)
-        else:
-            plain = {kind for kind in kinds if kind in (bool, int, float, str)}
-            good = not plain or (type(value) in plain) or (isinstance(value, str) and "Literal" in words)
-        if not good:
-            raise ValueError(f"{name} is {value!r} ({type(value).__name__}); expected {words}.")
-
-
-def check_ranges(settings: Any) -> None:
-    """Raise ValueError naming the first field of a wrong kind or outside its declared range."""
-    check_types(settings)
-    for field in dataclasses.fields(settings):
-        value, metadata = getattr(settings, field.name), field.metadata
-        if value is None:
-            continue
-        if metadata.get("choices") and value not in metadata["choices"]:
-            raise ValueError(f"{field.name} is {value!r}; expected one of: {', '.join(metadata['choices'])}.")
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, bool) or not isinstance(number, int | float):
-                continue
-            too_low = metadata.get("at_least") is not None and number < metadata["at_least"]
-            at_edge = metadata.get("above") is not None and number <= metadata["above"]
-            too_high = metadata.get("at_most") is not None and number > metadata["at_most"]
-            if too_low or at_edge or too_high or not math.isfinite(number):
-                expected = range_text(metadata) or "a finite number"
-                raise ValueError(
-                    f"{field.name} is {value!r}; expected {expected}. Choose a value in that range."
-                )
-
-
-def scheduled(value: float | None, schedule: Schedule, progress: float) -> float | None:
-    """The value of a schedule at ``progress`` in [0, 1]; linear and cosine fall from the value to 0.
-
-    linear: value * (1 - progress);  cosine: value * (1 + cos(pi * progress)) / 2;  None stays None.
-    """
-    if value is None or schedule == "constant":
-        return value
-    factor = 1.0 - progress if schedule == "linear" else 0.5 * (1.0 + math.cos(math.pi * progress))
-    return value * factor
-
-
-SCHEDULES = get_args(Schedule)
+from tightrope.settings.fields import SCHEDULES, Schedule, scheduled, setting
+from tightrope.settings.values import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
-class UpdateSettings:
+class UpdateSettings(Settings):
     """What every update rule of the family reads."""
 
     gamma: float = setting(
@@ -146,12 +50,8 @@ class UpdateSettings:
         at_least=1,
     )
 
-    def __post_init__(self) -> None:
-        """Check every field against its range."""
-        check_ranges(self)
-
     def at(self, progress: float) -> Self:
-        """The settings in force at ``progress`` in [0, 1]: each scheduled number at its present value."""
+        """The settings at ``progress`` in [0, 1]: each scheduled number has its present value."""
         names = [f.name for f in dataclasses.fields(self) if f.name.endswith("_schedule")]
         bases = {name.removesuffix("_schedule"): getattr(self, name) for name in names}
         bases["critic_learning_rate"] = self.learning_rate_schedule
@@ -160,13 +60,10 @@ class UpdateSettings:
         )
 
     def unchecked(self, **values: Any) -> Self:
-        """A copy with these values, not checked: what is in force may lie at the edge of what a user may
-        ask.
-        """
-        copy = object.__new__(type(self))
-        for field in dataclasses.fields(self):
-            object.__setattr__(copy, field.name, values.get(field.name, getattr(self, field.name)))
-        return copy
+        """A copy with these values, not checked: a schedule may end at a value that no user may give."""
+        copied = copy.copy(self)
+        vars(copied).update(values)
+        return copied
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +99,7 @@ class PPOSettings(UpdateSettings):
         above=0,
     )
     recompute_advantages: bool = setting(
-        False, "Estimate values and advantages anew before each later epoch."
+        False, "Estimate values and advantages again before each later epoch."
     )
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,39 +14,35 @@ import torch
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
-from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
+from tightrope.algorithms.optimise import (
+    make_optimiser,
+    optimiser_tensors,
+    restore_optimiser,
+    set_learning_rates,
+)
 from tightrope.algorithms.settings import PPOSettings
-from tightrope.control import engines
-from tightrope.control.collect import Collector, Rollout, to_batch
-from tightrope.control.environments import Environments, available_cores, make_environments
-from tightrope.control.faults import policy_of
-from tightrope.control.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
-from tightrope.control.policies import Policy
+from tightrope.control.engine import choose as engines
+from tightrope.control.engine.base import limited_threads
+from tightrope.control.environments.base import Environments
+from tightrope.control.environments.faults import policy_of
+from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.masks import flat_mask
+from tightrope.control.environments.processes import available_cores
+from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
+from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve
+from tightrope.control.rollout.advantages import to_batch
+from tightrope.control.rollout.collector import Collector
+from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import ObservationLayout
-from tightrope.control.threads import limited_threads
 from tightrope.maths.values import explained_variance
-from tightrope.runs.grid import crosses
+from tightrope.runs import checkpoint
+from tightrope.training.learner import Update, crosses
+from tightrope.training.parameters import Tensors
 
 Array = np.ndarray
 CRUMB = 16  # columns; ten epochs on fewer steps than this would only add noise to a finished policy
-
-
-@dataclass(frozen=True)
-class Progress:
-    """One update of a run: agent steps so far, the budget, every metric, and the episodes that ended.
-
-    ``on_grid``: the update reached a point of the checkpoint grid; environments that cannot give their state
-    begin anew behind it, whether or not anything is saved. ``before``: ``step`` before the update.
-    """
-
-    step: int
-    total_steps: int
-    metrics: dict[str, float]
-    episodes: list[tuple[float, int, bool]]
-    on_grid: bool = False
-    before: int = 0
 
 
 class Agent:
@@ -92,6 +87,7 @@ class Agent:
         self.sampling_rng, self.update_rng, self.predict_rng = (np.random.default_rng(x) for x in seeds)
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
         self.steps, self.rollbacks, self.kl_beta = 0, 0, getattr(present.update, "kl_beta", None)
+        self.changes: dict[str, Any] = {}  # of the update rule's settings, made by a listener
         self.fresh, self.notify = True, notify  # fresh: episodes begin anew with the next rollout
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
 
@@ -105,7 +101,7 @@ class Agent:
             pass
         return self
 
-    def iterate(self, total_steps: int | None = None, *, start: int | None = None) -> Iterator[Progress]:
+    def iterate(self, total_steps: int | None = None, *, start: int | None = None) -> Iterator[Update]:
         """The same, one update at a time: ``for report in agent.iterate(n): ...``.
 
         ``start``: the agent step at which this budget began (default: now).
@@ -123,7 +119,7 @@ class Agent:
             first, after = False, self.steps - start
             on_grid = crosses(before, after, budget, every)
             self.fresh = on_grid and not self.environments.gives_state
-            yield Progress(after, budget, metrics, episodes, on_grid, before)
+            yield Update(after, budget, metrics, before, on_grid, episodes)
 
     def _next_columns(self, budget: int, start: int) -> int:
         """Columns of the next rollout, never more than the budget allows; a crumb at its end is left
@@ -137,7 +133,7 @@ class Agent:
         self, columns: int, progress: float, *, check: bool
     ) -> tuple[dict[str, float], list[tuple[float, int, bool]]]:
         """collect -> advantages -> update -> statistics."""
-        present = self.settings.update.at(progress)
+        present = self.settings.update.unchecked(**self.changes).at(progress)
         if isinstance(present, PPOSettings) and self.kl_beta is not None:
             present = present.unchecked(kl_beta=self.kl_beta)
         set_learning_rates(self.optimiser, present)
@@ -196,11 +192,9 @@ class Agent:
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
         rows = len(next(iter(inputs.values())))
         masks = layout.mask_of(observation) if action_masks is None and layout.has_mask else action_masks
-        flat_mask = actions.flatten_mask(masks, rows)
-        if flat_mask is not None:
-            if len(blocked := actions.blocked_rows(flat_mask)):
-                raise ValueError(f"action_masks forbid every choice in row {blocked[0]}; allow at least one.")
-            inputs = {**inputs, "action_mask": flat_mask}
+        action_mask = flat_mask(masks, rows, actions)
+        if action_mask is not None:
+            inputs = {**inputs, "action_mask": action_mask}
         tensors = self.policy.tensors(inputs)
         if deterministic:
             chosen = self.policy.mode(tensors)
@@ -253,11 +247,81 @@ class Agent:
 
     def save(self, path: str | Path) -> Path:
         """Write policy, optimiser, normalisers and random generators into the folder ``path``; nothing is
-        pickled.
+        pickled. Raises CannotWrite.
         """
-        from tightrope.control.saving import save_agent
+        return checkpoint.save(Path(path), *self.snapshot())
 
-        return save_agent(self, Path(path))
+    def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
+        """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
+        tensors = {"policy": dict(self.policy.state_dict()), "optimiser": optimiser_tensors(self.optimiser)}
+        normalisers = self.normalisers.state()
+        if normalisers:
+            tensors["normalisers"] = normalisers
+        state = {
+            "settings": self.settings.to_json(),
+            "steps": self.steps,
+            "kl_beta": self.kl_beta,
+            "rollbacks": self.rollbacks,
+            "environment_restarts": self.environments.restarts,
+            "own_policy": self.policy.own is not None,
+            "own_environment": self.env is not None and not isinstance(self.env, str),
+            "rng": {
+                "sampling": self.sampling_rng.bit_generator.state,
+                "update": self.update_rng.bit_generator.state,
+            },
+        }
+        return tensors, state
+
+    def restore(self, tensors: Tensors, state: dict[str, Any]) -> None:
+        """Put back what `snapshot` gave, into an agent of the same settings."""
+        self.policy.load_state_dict(tensors["policy"])
+        restore_optimiser(self.optimiser, tensors["optimiser"])
+        normalisers = dict(tensors.get("normalisers", {}))
+        running = normalisers.get("rewards.running")
+        if running is not None and len(running) != self.environments.num_envs:
+            normalisers["rewards.running"] = torch.zeros(self.environments.num_envs, dtype=torch.float64)
+        self.normalisers.load(normalisers)
+        beta = state["kl_beta"]
+        self.steps = int(state["steps"])
+        self.kl_beta = None if beta is None else float(beta)
+        self.rollbacks = int(state.get("rollbacks", 0))  # missing in old runs
+        self.collector.count_from(max(0, int(state.get("environment_restarts", 0))))
+        self.sampling_rng.bit_generator.state = state["rng"]["sampling"]
+        self.update_rng.bit_generator.state = state["rng"]["update"]
+
+    def resume_episodes(self, episodes: Any) -> list[str]:
+        """After `restore`: continue the episodes that ran at the checkpoint, ``episodes`` as
+        `Collector.state` gave them, where the environments can take their state. Otherwise new episodes
+        begin, as they do at this step in an uninterrupted run; the lines to print say so.
+        """
+        if not self.steps:
+            return []
+        if episodes is not None and self.environments.gives_state:
+            self.collector.restore(episodes)
+            self.fresh = False
+            return []
+        what = f"{self.environments.num_envs} environments begin new episodes at step {self.steps:,}"
+        if episodes is not None:
+            return [
+                f"warning: {what}: the run's environments could give their state, these cannot, so that the "
+                "end may differ."
+            ]
+        seed = self.settings.seed
+        return [f"{what}, with seeds of (seed {seed}, step), as on every point of the checkpoint grid."]
+
+    def roll_back(self, tensors: Tensors, state: dict[str, Any]) -> None:
+        """Go back to a checkpoint of this agent, with random generators that depend on the seed, the step and
+        the number of rollbacks. Environments are as after a resume; restarts so far stay counted.
+        """
+        rollbacks, restarts = self.rollbacks + 1, self.environments.restarts
+        self.restore(tensors, state)
+        self.rollbacks = rollbacks
+        self.fresh = True
+        self.collector.count_from(restarts)
+        self.resume_episodes(state.get("episodes"))
+        for k, rng in ((1, self.sampling_rng), (2, self.update_rng)):
+            other = np.random.default_rng([self.settings.seed, k, self.steps, rollbacks])
+            rng.bit_generator.state = other.bit_generator.state
 
     def close(self) -> None:
         """Close the environments, and end their workers and the engine's thread."""

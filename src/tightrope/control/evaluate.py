@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from tightrope.control import tasks
-from tightrope.control.environments import Environments, make_environments
-from tightrope.control.faults import policy_of
+from tightrope.control.environments import tasks
+from tightrope.control.environments.base import Environments
+from tightrope.control.environments.faults import policy_of
+from tightrope.control.environments.make import make_environments
+from tightrope.control.settings import EVALUATION_SEED
 
 Array = np.ndarray
-EVALUATION_SEED = 1_000_003  # far from training's seeds, which start at settings.seed
 MAX_COPIES = 10
 
 

@@ -13,8 +13,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from tightrope.control import tasks
-from tightrope.control.evaluate import EVALUATION_SEED
+from tightrope.control.environments import tasks
+from tightrope.control.environments.masks import find_source
+from tightrope.control.settings import EVALUATION_SEED
 
 MAX_FRAMES = 10_000
 DEFAULT_FPS = 30
@@ -118,6 +119,8 @@ def _play(agent: Any, task: gym.Env, target: Path, episodes: int, seed: int) -> 
     try:
         for episode in range(episodes):
             observation, info = task.reset(seed=seed + episode)
+            layouts = (agent.environments.observation_layout, agent.environments.action_layout)
+            masks = find_source(task, info, *layouts)
             total, over = 0.0, False
             while not over and frames < MAX_FRAMES:
                 frame = _frame(task, agent.settings.env)
@@ -127,7 +130,7 @@ def _play(agent: Any, task: gym.Env, target: Path, episodes: int, seed: int) -> 
                     writer.send(None)
                 writer.send(np.ascontiguousarray(frame))
                 frames += 1
-                action, _ = agent.predict(observation, action_masks=_mask(task, info))
+                action, _ = agent.predict(observation, action_masks=masks.read(observation, info))
                 observation, reward, terminated, truncated, info = task.step(action)
                 total, over = total + float(reward), bool(terminated or truncated)
             returns.append(total)
@@ -149,13 +152,3 @@ def _frame(task: gym.Env, name: str) -> np.ndarray:
             f"{name} rendered {type(frame).__name__}; expected an RGB array of shape (height, width, 3)."
         )
     return frame.astype(np.uint8, copy=False)
-
-
-def _mask(task: gym.Env, info: dict[str, Any]) -> Any:
-    """The action mask of the present state, from the info or the environment's own method; None without
-    any.
-    """
-    if "action_mask" in info:
-        return info["action_mask"]
-    own = getattr(task.unwrapped, "action_masks", None)
-    return own() if callable(own) else None

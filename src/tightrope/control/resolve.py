@@ -1,4 +1,4 @@
-"""From what the user said to complete settings: defaults < preset of the task < settings file < flags."""
+"""Complete settings for a task: defaults < preset of the task < settings file < flags."""
 
 from __future__ import annotations
 
@@ -34,19 +34,21 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
     if limit is not None and "checkpoint_every" not in values:
         total = {"total_steps": TrainSettings.total_steps, **merged}["total_steps"]
         if type(total) is int and total > 0 and type(sizes[0]) is int:
-            chosen["checkpoint_every"] = _room(limit * sizes[0] / total)
+            chosen["checkpoint_every"] = _checkpoint_interval(limit * sizes[0] / total)
     return TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
 
 
-def _room(episode: float) -> float:
-    """The default of checkpoint_every, or more where the longest ``episode`` of all copies, as a share of the
-    run, takes more: environments begin anew on that grid, and their episodes shall be able to end before it.
+def _checkpoint_interval(episode: float) -> float:
+    """checkpoint_every: its default, or more where an episode is a larger share of the run.
+
+    ``episode`` is the longest episode in all copies as a share of the run. Environments are reset at
+    checkpoints, so the interval is long enough for an episode to end before.
     """
     return min(1.0, max(TrainSettings.checkpoint_every or 1.0, math.ceil(1000 * episode) / 1000))
 
 
 def _time_limit(env: Any) -> int | None:
-    from tightrope.control.tasks import find_spec
+    from tightrope.control.environments.tasks import find_spec
 
     spec = find_spec(env) if isinstance(env, str) else getattr(env, "spec", None)
     return getattr(spec, "max_episode_steps", None)
@@ -62,7 +64,7 @@ def _name_of(env: Any) -> str:
 
 def _describe(env: Any) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
-    from tightrope.control.environments import make_environments
+    from tightrope.control.environments.make import make_environments
     from tightrope.control.spaces import action_layout, observation_layout
 
     vector = hasattr(env, "single_observation_space")

@@ -1,34 +1,30 @@
-"""``tightrope train`` and ``tightrope resume``: the loop around an agent that leaves a run folder behind."""
+"""``tightrope train`` and ``tightrope resume``: an agent in the training loop, which leaves a run folder."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tightrope.control.agent import AGENTS, Agent, Progress
-from tightrope.control.evaluate import EVALUATION_SEED, evaluate_agent, evaluation_environments
+from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.environments.make import Environments
+from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
-from tightrope.control.saving import (
-    name_again,
-    rebuild,
-    restore,
-    resume_episodes,
-    roll_back,
-    save_agent,
-    snapshot,
-)
-from tightrope.control.settings import TrainSettings, settings_from_json, settings_to_json
+from tightrope.control.saving import name_again, rebuild
+from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
-from tightrope.runs.grid import crosses
-from tightrope.runs.history import steps_in
-from tightrope.runs.report import Reporter, say, silent, teller, warn
-from tightrope.runs.rollback import rolling_back
+from tightrope.runs.history import Checkpoint
 from tightrope.runs.run import Run
+from tightrope.training import loop
+from tightrope.training.events import Listener, Listeners
+from tightrope.training.learner import Update, crosses
+from tightrope.training.parameters import Tensors
+from tightrope.training.resume import continue_from, newest_point
+from tightrope.training.tensorboard import require_tensorboard
 
 __all__ = ["resolve", "resume", "train"]
 
@@ -37,53 +33,54 @@ def train(
     settings: TrainSettings,
     *,
     run_dir: str | Path | None = None,
-    report: Reporter = silent,
+    listeners: Sequence[Listener] = (),
     env: Any = None,
     policy: Any = None,
 ) -> dict[str, Any]:
     """Train from the start; returns the summary that is also written to the run folder."""
+    told = Listeners(listeners)
     for risk in settings.risks():
-        warn(report, risk)
+        told.warn(risk)
+    require_tensorboard(settings.tensorboard)
     source = settings.env if env is None else env
-    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=teller(report))
+    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=told.tell)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
-    with Run.create(run_dir, settings_to_json(settings), name, tensorboard=settings.tensorboard) as run:
+    with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name) as run:
+        learner = AgentLearner(agent, run, told)
         if agent.policy.own is not None or not isinstance(source, str):
             # settings.json alone could not give these first weights again
-            _save(agent, run, float("-inf"), 0.0, report)
-        return _continue(agent, run, settings.total_steps, report, best=float("-inf"), wall=0.0)
+            tensors, state = learner.snapshot()
+            run.save(0, tensors, state, keep=settings.keep_checkpoints, say=told.tell)
+        with contextlib.closing(learner):
+            return loop.train(learner, run, told)
 
 
 def resume(
     run_dir: str | Path,
     *,
     total_steps: int | None = None,
-    report: Reporter = silent,
+    listeners: Sequence[Listener] = (),
     env: Any = None,
     policy: Any = None,
 ) -> dict[str, Any]:
-    """Go on from the newest checkpoint, or from the start where there is none yet; the end is that of a run
-    without a break, bit for bit (docs/resume.md says what that takes).
+    """Continue from the newest checkpoint, or from the start where there is none yet; the end is that of an
+    uninterrupted run, bit for bit (docs/resume.md says what that takes).
 
     ``total_steps`` extends a finished run: schedules and grid run over the new budget from here on.
     """
     with Run.open(run_dir, own=True) as run:
-        return _resume(run, total_steps, report, env, policy)
+        return _resume(run, total_steps, Listeners(listeners), env, policy)
 
 
-def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, policy: Any) -> dict[str, Any]:
+def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy: Any) -> dict[str, Any]:
     run_dir = run.path
-    if not steps_in(run.checkpoints) and run.read_metrics():
-        warn(report, f"{run_dir} has rows and no checkpoint; it begins at step 0 again.")
-    point = run.resume_point(teller(report)) if steps_in(run.checkpoints) else None
+    point = newest_point(run, told)
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
-        settings = settings_from_json(run.settings if point is None else state["settings"])
+        settings = TrainSettings.from_json(run.settings if point is None else state["settings"])
         own_environment = bool(state.get("own_environment")) or ":" in settings.env
         own_policy = bool(state.get("own_policy"))
-        best = float("-inf") if state.get("best") is None else float(state["best"])
-        wall = float(state.get("wall_seconds", 0.0))
     if env is None and own_environment:
         raise ValueError(name_again(run_dir, settings.env, "resume"))
     if own_policy and policy is None:
@@ -91,162 +88,181 @@ def _resume(run: Run, total_steps: int | None, report: Reporter, env: Any, polic
             f"{run_dir} holds a policy module of somebody's own, which no file may import. Go on in Python: "
             f"tightrope.control.train.resume({str(run_dir)!r}, policy=module)."
         )
-    # of a run that was extended and stopped before its next checkpoint, settings.json alone knows the budget
+    # of a run that was extended and stopped before its next checkpoint, only settings.json has the budget
     if total_steps is None:
         with understood(run_dir):
             total_steps = int(run.settings["total_steps"])
     settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
-    more = {"policy": policy, "settings": settings, "notify": teller(report)}
-    agent = rebuild(source, run_dir, command="resume", **more)
-    if point is not None:
-        with understood(point.folder):
-            restore(agent, point.tensors, state)
-            if agent.steps != step_of(point.folder):
-                raise ValueError(f"its steps are {agent.steps}, its name says {step_of(point.folder)}")
-            lines = resume_episodes(agent, state)
-        for line in lines:
-            teller(report)(line)
-    run.rewind(point)
-    run.update_settings(settings_to_json(agent.settings))
-    if agent.steps + settings.num_envs > settings.total_steps:
-        say(report, f"{run_dir} has its {settings.total_steps} steps; --total-steps N goes on from there.")
-    return _continue(agent, run, settings.total_steps, report, best=best, wall=wall)
+    agent = rebuild(source, run_dir, command="resume", policy=policy, settings=settings, notify=told.tell)
+    learner = AgentLearner(agent, run, told)
+    with contextlib.closing(agent), contextlib.closing(learner):
+        if point is not None:
+            learner.restore(point)
+        continue_from(learner, run, point)
+        if learner.complete:
+            told.info(f"{run_dir} has its {learner.total} steps; --total-steps N goes on from there.")
+        return loop.train(learner, run, told)
 
 
-def _continue(
-    agent: Agent, run: Run, total_steps: int, report: Reporter, *, best: float, wall: float
-) -> dict[str, Any]:
-    """The loop: update -> record -> evaluate -> save, until the budget is spent."""
-    settings, begin, wall_before = agent.settings, agent.steps, wall
-    evaluator = _Evaluator(agent, run, report, best)
-    report("start", _start(agent, run, total_steps))
-    try:
-        with signals.stoppable():
-            clock = time.perf_counter()
-            for progress in _updates(agent, run, total_steps, report):
-                wall += time.perf_counter() - clock
-                signals.check()
-                step, metrics = agent.steps, {**progress.metrics, "time/seconds": wall}
-                last = min(step, total_steps - 1)
-                if crosses(progress.before, last, total_steps, settings.evaluate_every):
-                    metrics |= evaluator.evaluate()
-                run.record_episodes(
-                    {"step": step, "return": r, "length": n, "terminated": t} for r, n, t in progress.episodes
-                )
-                run.record(step, wall, metrics)
-                report(
-                    "update", {"step": step, "total_steps": total_steps, "metrics": metrics, "seconds": wall}
-                )
-                if progress.on_grid and step + settings.num_envs <= total_steps:  # the end has its own save
-                    _save(agent, run, evaluator.best, wall, report)
-                clock = time.perf_counter()
-            final = evaluator.evaluate()
-            _save(agent, run, evaluator.best, wall, report, final=True)
-    finally:
-        evaluator.close()
-        agent.close()
-    summary = _summary(agent, run, wall, (agent.steps - begin) / max(wall - wall_before, 1e-9))
-    summary |= {"final": final, "best_mean_reward": evaluator.best if math.isfinite(evaluator.best) else None}
-    run.finish(summary)
-    report("finish", summary)
-    return summary
+class AgentLearner:
+    """An agent in the training loop, a `Learner`: evaluated on other episodes, its best policy kept.
 
-
-def _updates(agent: Agent, run: Run, total_steps: int, report: Reporter) -> Iterator[Progress]:
-    """The agent's updates; after a NaN or an infinity, from the newest checkpoint on, as often as allowed."""
-    updates = rolling_back(
-        lambda: agent.iterate(total_steps, start=0),
-        run,
-        lambda point: roll_back(agent, point),
-        teller(report),
-        taken=agent.rollbacks,
-        limit=agent.settings.max_rollbacks,
-    )
-    for progress in updates:
-        if agent.rollbacks:
-            progress.metrics["train/rollbacks"] = float(agent.rollbacks)
-        yield progress
-
-
-def _start(agent: Agent, run: Run, total_steps: int) -> dict[str, Any]:
-    settings, environments = agent.settings, agent.environments
-    workers = f" in {environments.num_workers} processes" if environments.backend == "workers" else ""
-    who = f"environments: {environments.num_envs} x {settings.env}, {environments.backend}{workers}"
-    lines = [agent.engine_line, who]
-    return {
-        "settings": settings_to_json(settings),
-        "run_dir": str(run.path),
-        "lines": lines,
-        "step": agent.steps,
-        "total_steps": total_steps,
-    }
-
-
-def _summary(agent: Agent, run: Run, wall: float, rate: float) -> dict[str, Any]:
-    settings = agent.settings
-    names = ("env", "algorithm", "seed", "engine")
-    numbers = {"steps": agent.steps, "wall_seconds": wall, "steps_per_second": rate}
-    return {**{name: getattr(settings, name) for name in names}, **numbers, "run_dir": str(run.path)}
-
-
-class _Evaluator:
-    """Periodic evaluation, outside the clock; keeps the best policy. Off when the environment cannot be
-    copied.
+    There is no evaluation while training where the environment cannot be copied.
     """
 
-    def __init__(self, agent: Agent, run: Run, report: Reporter, best: float) -> None:
-        self.agent, self.run, self.report, self.best = agent, run, report, best
-        self.environments, self.first_state = None, None
-        if agent.settings.evaluate_every is None:
-            return
-        try:
-            episodes = agent.settings.evaluation_episodes
-            self.environments = evaluation_environments(agent.env, agent.settings, episodes)
-        except ValueError as error:
-            say(report, f"no evaluation while training: {error}")
-            return
-        if self.environments.gives_state:
-            # what a copy keeps from one evaluation to the next must not change what a resumed run sees
-            self.environments.reset(EVALUATION_SEED)
-            self.first_state = self.environments.get_state()
+    def __init__(self, agent: Agent, run: Run, listeners: Listeners) -> None:
+        self.agent = agent
+        self.settings = agent.settings
+        self.changes = agent.changes
+        self.run = run
+        self.listeners = listeners
+        self.seconds = 0.0
+        self.best = -math.inf
+        self.final: dict[str, float] = {}
+        self.merit = None  # the newest checkpoints are kept; the best policy has its own folder
+        self._environments: Environments | None = None
+        self._first_state: Any = None
+        self._begin = (0, 0.0)
 
-    def evaluate(self) -> dict[str, float]:
-        if self.environments is None:
+    @property
+    def position(self) -> int:
+        """Agent steps so far."""
+        return self.agent.steps
+
+    @property
+    def total(self) -> int:
+        """Agent steps of the whole run."""
+        return self.settings.total_steps
+
+    @property
+    def complete(self) -> bool:
+        """Whether the budget is spent: what is left is less than one step in every environment."""
+        return self.position + self.settings.num_envs > self.total
+
+    @property
+    def rollbacks(self) -> int:
+        """How often the run went back to a checkpoint."""
+        return self.agent.rollbacks
+
+    def settings_json(self) -> dict[str, Any]:
+        """The content of settings.json."""
+        return self.settings.to_json()
+
+    def changeable(self) -> Any:
+        """The settings of which some can be changed during the run: the update rule's."""
+        return self.settings.update
+
+    def begin(self) -> list[str]:
+        """Make the environments for evaluation; the lines that describe engine and environments."""
+        self._begin = (self.position, self.seconds)
+        if self.settings.evaluate_every is not None:
+            self._open_evaluation()
+        environments = self.agent.environments
+        workers = f" in {environments.num_workers} processes" if environments.backend == "workers" else ""
+        count = f"{environments.num_envs} x {self.settings.env}"
+        return [self.agent.engine_line, f"environments: {count}, {environments.backend}{workers}"]
+
+    def _open_evaluation(self) -> None:
+        try:
+            self._environments = evaluation_environments(
+                self.agent.env, self.settings, self.settings.evaluation_episodes
+            )
+        except ValueError as error:
+            self.listeners.info(f"no evaluation while training: {error}")
+            return
+        if self._environments.gives_state:
+            # what a copy keeps from one evaluation to the next must not change what a resumed run sees
+            self._environments.reset(EVALUATION_SEED)
+            self._first_state = self._environments.get_state()
+
+    def iterate(self) -> Iterator[Update]:
+        """The agent's updates."""
+        return self.agent.iterate(self.total, start=0)
+
+    def evaluate(self, update: Update | None) -> dict[str, float]:
+        """The evaluation at points of its grid; the one at the end is `conclude`'s."""
+        if update is None:
             return {}
-        self.environments.count_from(0)  # what a resumed run has not seen must not end it sooner or later
-        if self.first_state is not None:
-            self.environments.set_state(self.first_state)
-        result = evaluate_agent(self.agent, self.environments, self.agent.settings.evaluation_episodes)
-        metrics = {
+        last = min(update.step, self.total - 1)
+        due = crosses(update.before, last, self.total, self.settings.evaluate_every)
+        return self._evaluate() if due else {}
+
+    def conclude(self) -> dict[str, float]:
+        """The final evaluation."""
+        self.final = self._evaluate()
+        return self.final
+
+    def _evaluate(self) -> dict[str, float]:
+        if self._environments is None:
+            return {}
+        # restarts in evaluations must not count towards the limit: a resumed run has not seen them
+        self._environments.count_from(0)
+        if self._first_state is not None:
+            self._environments.set_state(self._first_state)
+        result = evaluate_agent(self.agent, self._environments, self.settings.evaluation_episodes)
+        if result["mean_return"] > self.best:
+            self._keep(result["mean_return"])
+        return {
             "eval/mean_reward": result["mean_return"],
             "eval/std_reward": result["std_return"],
             "eval/mean_length": result["mean_length"],
             "eval/episodes": float(result["episodes"]),
         }
-        self.report("evaluation", {"step": self.agent.steps, **metrics})
-        if result["mean_return"] > self.best:
-            self._keep(result["mean_return"])
-        return metrics
 
     def _keep(self, mean: float) -> None:
         """Save the policy as the best; where the disk refuses, the best one is still the one before."""
         try:
             with signals.whole():
-                save_agent(self.agent, self.run.best)
+                self.agent.save(self.run.best)
         except CannotWrite as error:
-            warn(self.report, f"The best policy is not saved: {error.what} {error.advice}. Training goes on.")
+            self.listeners.warn(
+                f"The best policy is not saved: {error.what} {error.advice}. Training goes on."
+            )
         else:
             self.best = mean
 
+    def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
+        """The agent, the best evaluation, and the episodes that are running where they can be continued."""
+        tensors, state = self.agent.snapshot()
+        state |= {"best": self.best, "wall_seconds": self.seconds}
+        state["episodes"] = self.agent.collector.state() if self.agent.steps else None
+        return tensors, state
+
+    def restore(self, point: Checkpoint) -> None:
+        """Put back a checkpoint. CheckpointError when it is not what an agent of these settings saved."""
+        with understood(point.folder):
+            self.agent.restore(point.tensors, point.state)
+            if self.position != step_of(point.folder):
+                raise ValueError(f"its steps are {self.position}, its name says {step_of(point.folder)}")
+            best = point.state.get("best")
+            self.best = -math.inf if best is None else float(best)
+            self.seconds = float(point.state.get("wall_seconds", 0.0))
+            lines = self.agent.resume_episodes(point.state.get("episodes"))
+        for line in lines:
+            self.listeners.tell(line)
+
+    def roll_back(self, point: Checkpoint) -> None:
+        """Put back a checkpoint of this run; the best policy stays."""
+        self.agent.roll_back(point.tensors, point.state)
+
+    def finish(self, run: Run) -> dict[str, Any]:
+        """The summary."""
+        step, seconds = self._begin
+        return {
+            "env": self.settings.env,
+            "algorithm": self.settings.algorithm,
+            "seed": self.settings.seed,
+            "engine": self.settings.engine,
+            "steps": self.position,
+            "wall_seconds": self.seconds,
+            "steps_per_second": (self.position - step) / max(self.seconds - seconds, 1e-9),
+            "run_dir": str(run.path),
+            "final": self.final,
+            "best_mean_reward": self.best if math.isfinite(self.best) else None,
+        }
+
     def close(self) -> None:
-        if self.environments is not None:
-            self.environments.close()
-
-
-def _save(agent: Agent, run: Run, best: float, wall: float, report: Reporter, *, final: bool = False) -> None:
-    tensors, state = snapshot(agent)
-    state |= {"best": best, "wall_seconds": wall}
-    state["episodes"] = agent.collector.state() if agent.steps else None
-    keep, say = agent.settings.keep_checkpoints, teller(report)
-    run.save(agent.steps, tensors, state, keep=keep, say=say, final=final)
+        """Close the environments for evaluation."""
+        if self._environments is not None:
+            self._environments.close()

@@ -10,11 +10,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tightrope.language.alignment import align
-    from tightrope.language.evaluate import sample_run
-    from tightrope.language.reward_model import load_reward, train_reward
+    from tightrope.language.alignment.align import align
+    from tightrope.language.compare import sample_run
+    from tightrope.language.reward.model import load_reward
     from tightrope.language.settings import RECIPES, AlignSettings, RewardSettings, SFTSettings
-    from tightrope.language.sft import train_sft
+    from tightrope.language.supervised.preferences import train_reward
+    from tightrope.language.supervised.sft import train_sft
 
 __all__ = [
     "AlignSettings",
@@ -29,11 +30,11 @@ __all__ = [
 ]
 
 _HOMES = {
-    "align": "alignment",
-    "load_reward": "reward_model",
-    "sample_run": "evaluate",
-    "train_reward": "reward_model",
-    "train_sft": "sft",
+    "align": "alignment.align",
+    "load_reward": "reward.model",
+    "sample_run": "compare",
+    "train_reward": "supervised.preferences",
+    "train_sft": "supervised.sft",
 }
 
 

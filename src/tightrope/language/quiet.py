@@ -13,7 +13,7 @@ LIBRARIES = r"(tightrope|transformers|torch|tokenizers|huggingface_hub|peft|safe
 def quiet() -> Iterator[None]:
     """Inside, transformers and the hub show no progress bars and log errors only; both are put back after.
 
-    Deprecations are for those who write code, so the libraries' are hidden. The filter stands last in the
+    Deprecations are for those who write code, so the libraries' are hidden. The filter comes last in the
     list: whatever a caller has asked for, ``-W error`` for one, comes before it. Also a decorator.
     """
     from transformers.utils import logging

@@ -11,16 +11,18 @@ from torch import Tensor
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser
-from tightrope.language.collect import Experience, gather, rewards_of, to_batch
-from tightrope.language.data import Prompt, pad_left, pad_right
-from tightrope.language.policy_model import PolicyModel
+from tightrope.findings import Finding
+from tightrope.language.alignment.experience import gather, rewards_of, to_batch
+from tightrope.language.data.batching import pad_left, pad_right
+from tightrope.language.data.examples import Prompt
+from tightrope.language.generation.distribution import Sampling, token_statistics
+from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.policy.policy_model import PolicyModel
+from tightrope.language.policy.roles import Roles, make_roles
+from tightrope.language.policy.rollout import Experience
 from tightrope.language.quiet import quiet
-from tightrope.language.rewards import Scores
-from tightrope.language.roles import Roles, make_roles
-from tightrope.language.sampling import log_ratio_limit
+from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings, RLHFSettings
-from tightrope.language.token_stats import Sampling, token_statistics
-from tightrope.runs.findings import Finding
 
 WORDS = ("The", "Once upon a time there was", "I think that", "a b c d e f g h")
 GRADIENT_LIMIT = 1e-3  # relative, of the norm: float32 sums in another order
@@ -60,11 +62,11 @@ def _limit(roles: Roles) -> float:
 
 @torch.no_grad()
 def _same_logits(roles: Roles, experience: Experience) -> Finding:
-    """The bare trunk and its head beside what the model itself says, unpadded rows one at a time."""
+    """The bare trunk and its head beside the model's own logits, unpadded rows one at a time."""
     worst, head = 0.0, roles.trunk.parts.head
     for row, real in zip(experience.tokens, experience.real, strict=True):
         tokens = row[real][None]
-        hidden = roles.reference_hidden(tokens, torch.ones_like(tokens, dtype=torch.bool), None)[0, :-1]
+        hidden = roles.reference.hidden(tokens, torch.ones_like(tokens, dtype=torch.bool))[0, :-1]
         ours = token_statistics(hidden, head, tokens[0, 1:], Sampling()).logp
         logits = roles.model(input_ids=tokens, use_cache=False).logits[0, :-1].float()
         theirs = logits.log_softmax(1).gather(1, tokens[0, 1:, None])[:, 0]
@@ -81,7 +83,7 @@ def _same_policy(roles: Roles, experience: Experience) -> Finding:
     gap = float((experience.responses.logp - experience.logp)[mask].abs().max())
     return Finding(
         "sampling and training agree", gap <= _limit(roles), f"largest gap {gap:.1e} nats a token",
-        "The model says something else with its KV cache than without. Update transformers, or report the "
+        "The model computes other numbers with its KV cache than without. Update transformers, or report the "
         "model.",
     )  # fmt: skip
 
@@ -110,7 +112,7 @@ def _padding_side(roles: Roles, experience: Experience) -> Finding:
     sides = []
     for pad in (pad_right, pad_left):
         tokens, real = (x.to(experience.tokens.device) for x in pad(rows))
-        hidden, known = roles.policy_hidden(tokens, real, None), real[:, 1:] & real[:, :-1]
+        hidden, known = roles.policy.hidden(tokens, real), real[:, 1:] & real[:, :-1]
         states, head = hidden[:, :-1][known], roles.trunk.parts.head
         sides.append(token_statistics(states, head, tokens[:, 1:][known], Sampling()).logp)
     gap = float((sides[0] - sides[1]).abs().max())
@@ -226,7 +228,7 @@ def _returns(experience: Experience, rewards: Tensor, batch: Batch) -> Finding:
 
 
 def _trunk(roles: Roles) -> Finding:
-    from tightrope.language.trunk import Trunk
+    from tightrope.language.model.trunk import Trunk
 
     layers = len(roles.trunk.parts.layers)
     cut = Trunk(roles.model, layers // 2).cut if layers > 1 else 1

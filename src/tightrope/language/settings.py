@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
-from tightrope.algorithms.peer_names import PEER_NAMES
-from tightrope.algorithms.settings import PPOSettings, Schedule, check_ranges, setting
+from tightrope.algorithms.settings import PPOSettings
+from tightrope.settings.fields import SCHEDULES, Schedule, fixed, of_update_rule, setting
+from tightrope.settings.values import Settings
 
 Tune = Literal["lora", "full"]
-# kl_adapt and the KL-penalised surrogate are the control story's; here kl_beta weighs the KL to the reference
-NOT_HERE = ("kl_beta", "kl_adapt", "recompute_advantages")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelSettings:
+class ModelSettings(Settings):
     """Which model, which of its weights are trained, where, and how often they are saved."""
 
     model: str = setting("glassllm", "Folder or hub id of the model, or a packaged one: glassllm, smollm2.")
@@ -26,7 +24,7 @@ class ModelSettings:
     lora_alpha: float = setting(32.0, "Adapters are scaled by lora_alpha / lora_rank.", above=0)
     lora_layers: int | None = setting(
         None,
-        "Adapt this many of the top layers; what lies below is computed once for all. none: every layer.",
+        "Adapt this many of the top layers; the layers below are computed once. none: every layer.",
         at_least=1,
     )
     seed: int = setting(0, "Seed of everything random.", at_least=0)
@@ -44,10 +42,12 @@ class ModelSettings:
         "Checkpoints that are kept: the newest, and the best by held-out figures. none: all.",
         at_least=2,
     )
-
-    def __post_init__(self) -> None:
-        """Check every field against its range."""
-        check_ranges(self)
+    max_rollbacks: int = setting(
+        0,
+        "After a NaN or an infinity: go back to the newest checkpoint this often; 0: end the run.",
+        at_least=0,
+    )
+    tensorboard: bool = setting(False, "Also write TensorBoard event files into the run folder.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class SupervisedSettings(ModelSettings):
     )
     learning_rate: float = setting(1e-4, "Adam's step size.", above=0)
     learning_rate_schedule: Schedule = setting(
-        "linear", "How the learning rate falls over the run.", choices=("constant", "linear", "cosine")
+        "linear", "How the learning rate falls over the run.", choices=SCHEDULES
     )
     max_grad_norm: float | None = setting(1.0, "Limit on the norm of the gradient; none: no limit.", above=0)
 
@@ -75,7 +75,7 @@ class SupervisedSettings(ModelSettings):
 class SFTSettings(SupervisedSettings):
     """Supervised fine-tuning on text, prompt and completion, or chats."""
 
-    on_completions: bool = setting(True, "Learn completions and assistant turns alone, not prompts.")
+    on_completions: bool = setting(True, "Learn completions and assistant turns only, not prompts.")
     pack: bool = setting(False, "Put several examples into one row; none sees another.")
 
 
@@ -102,6 +102,10 @@ class RLHFSettings(PPOSettings):
         None, "Responses per forward pass; splits a minibatch to save memory, the gradient is the same.",
         at_least=1,
     )  # fmt: skip
+    # The KL-penalised surrogate is for control only. In align, kl_beta weighs the KL to the reference.
+    kl_beta: float | None = fixed(None)
+    kl_adapt: float | None = fixed(None)
+    recompute_advantages: bool = fixed(False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +117,7 @@ class AlignSettings(ModelSettings):
     gold: str | None = setting(
         None, "A second judge of the same kinds, asked on held-out prompts; never trained on. none: no judge."
     )
-    update: RLHFSettings = dataclasses.field(
-        default_factory=RLHFSettings, metadata={"doc": "The update rule's."}
-    )
+    update: RLHFSettings = of_update_rule({"ppo": RLHFSettings})
     total_episodes: int = setting(4096, "Responses to train on; never exceeded.", at_least=1)
     batch_size: int = setting(64, "Responses per iteration.", at_least=1)
     samples_per_prompt: int = setting(1, "Responses to each prompt; they share its KV cache.", at_least=1)
@@ -138,7 +140,7 @@ class AlignSettings(ModelSettings):
         None, "Adapt kl_beta towards this KL per response, in nats (Ziegler: 6); none: fixed.", above=0
     )
     kl_horizon: float = setting(10_000.0, "Responses over which kl_beta adapts.", above=0)
-    kl_budget: float | None = setting(None, "Stop at this KL per response, in nats; none: go on.", above=0)
+    kl_budget: float | None = setting(None, "Stop at this KL per response, in nats; none: continue.", above=0)
 
     critic: str = setting(
         "head",
@@ -170,12 +172,7 @@ class AlignSettings(ModelSettings):
     ptx_data: str | None = setting(None, "Texts of the pretraining loss.")
     ptx_per_response: int = setting(1, "Pretraining texts per response (InstructGPT: 8).", at_least=1)
     reward_timeout: float | None = setting(
-        60.0, "Seconds a reward function may take; its samples are left out then. none: forever.", above=0
-    )
-    max_rollbacks: int = setting(
-        0,
-        "After a NaN or an infinity: go back to the newest checkpoint this often; 0: end the run.",
-        at_least=0,
+        60.0, "Seconds a reward function may take; its samples are left out then. none: no limit.", above=0
     )
     evaluate_every: float | None = setting(
         0.05, "Fraction of the run between gold scores on held-out prompts.", above=0, at_most=1
@@ -188,9 +185,7 @@ class AlignSettings(ModelSettings):
         """Check ranges, and the settings that must fit each other."""
         if self.critic is None:  # as in Python: no critic
             object.__setattr__(self, "critic", "none")
-        check_ranges(self)
-        if not isinstance(self.update, RLHFSettings):
-            raise ValueError(f"update is {type(self.update).__name__}; expected RLHFSettings.")
+        super().__post_init__()
         if self.batch_size % self.samples_per_prompt:
             raise ValueError(
                 f"batch_size {self.batch_size} is no multiple of samples_per_prompt "
@@ -228,7 +223,7 @@ class AlignSettings(ModelSettings):
         biased = self.kl not in ("k1-reward", "exact-split", "k2-loss", "exact-loss")
         if biased and not self.allow_biased_kl:
             raise ValueError(
-                f"kl {self.kl!r} has a gradient that is not the KL's. Use k1-reward or exact-split, or say "
+                f"kl {self.kl!r} has a gradient that is not the KL's. Use k1-reward or exact-split, or give "
                 "--allow-biased-kl to see what it does."
             )
         if self.ptx_weight and self.ptx_data is None:
@@ -241,7 +236,7 @@ class AlignSettings(ModelSettings):
 
     @property
     def logp_alone(self) -> bool:
-        """Whether log p is all of the head's work that is trained on, and the head itself is not."""
+        """Whether training needs only log p from the head, and the head itself is not trained."""
         return self.tune == "lora" and not self.exact_in_loss and not self.update.entropy_weight
 
     @property
@@ -249,28 +244,8 @@ class AlignSettings(ModelSettings):
         """Whether an epoch is one forward pass over all responses."""
         return self.update.minibatch_size >= self.batch_size and self.update.micro_batch_size is None
 
-    def with_values(self, **values: Any) -> Self:
-        """The same settings with these changed; names of the update rule's fields are found there."""
-        outer = {field.name for field in dataclasses.fields(self)}
-        if "critic" in values and values["critic"] is None:
-            values["critic"] = "none"
-        inner = {name: value for name, value in values.items() if name not in outer}
-        own = {name: value for name, value in values.items() if name in outer}
-        known = {field.name for field in dataclasses.fields(RLHFSettings)} - set(NOT_HERE)
-        unknown = sorted(set(inner) - known)
-        if unknown:
-            import difflib
-
-            peers = PEER_NAMES.get(unknown[0], "")
-            near = [peers] if peers in known | outer else []
-            near += difflib.get_close_matches(unknown[0], known | outer, n=1)
-            hint = f" Did you mean {near[0]}?" if near else ""
-            raise ValueError(f"align has no setting named {', '.join(unknown)}.{hint}")
-        own["update"] = dataclasses.replace(own.get("update", self.update), **inner)
-        return dataclasses.replace(self, **own)
-
     def risks(self) -> list[str]:
-        """What is unusual about these settings and why it is risky; they are run as asked all the same."""
+        """What is unusual about these settings and why it is risky; training starts all the same."""
         found = []
         if self.kl_beta == 0 and self.kl_budget is None:
             found.append(

@@ -17,7 +17,13 @@ from typing import Any
 
 from tightrope.runs.durable import BLOCK, replace_file, write_all, writing
 
-RECORDS = ("metrics.jsonl", "episodes.jsonl", "samples.jsonl")  # of a run: the files that grow
+# changes.jsonl: settings that a listener has changed
+RECORDS = (
+    "metrics.jsonl",
+    "episodes.jsonl",
+    "samples.jsonl",
+    "changes.jsonl",
+)  # of a run: the files that grow
 
 
 def plain(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
 from collections.abc import Callable, Iterable
@@ -10,7 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from tightrope.runs import checkpoint, durable, history, metrics, signals, versions
+from tightrope.metrics import table as metrics
+from tightrope.runs import checkpoint, durable, history, signals, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import CannotWrite, sync_folder, writing
 from tightrope.runs.folders import fresh, require_free, why_not
@@ -40,26 +40,21 @@ class Run:
     lock first (see `lock`). Readers may come at any time.
     """
 
-    def __init__(self, path: Path, settings: dict[str, Any], tensorboard: Any = None) -> None:
+    def __init__(self, path: Path, settings: dict[str, Any]) -> None:
         self.path = path
         self.settings = settings
-        self._tensorboard = tensorboard
         self._files: dict[str, Recorder] = {}
         self._lock: WriterLock | None = None
         self._costs: dict[str, float] = {}
         self._new_name = False  # of a record file, not yet durable
 
     @classmethod
-    def create(
-        cls, run_dir: str | Path | None, settings: dict[str, Any], name: str, *, tensorboard: bool = False
-    ) -> Run:
+    def create(cls, run_dir: str | Path | None, settings: dict[str, Any], name: str) -> Run:
         """A fresh run folder with settings.json in it.
 
         ``run_dir`` None: ``runs/<name>-<yyyymmdd-hhmmss>``. Nothing is ever overwritten: a folder that is
-        there and not empty raises ValueError, and so does ``tensorboard`` without its package, before
-        anything is written.
+        there and not empty raises ValueError before anything is written.
         """
-        writer_class = _summary_writer() if tensorboard else None
         with writing(Path("runs") if run_dir is None else Path(run_dir)):
             if run_dir is None:
                 path = fresh(Path("runs"), re.sub(r"[^\w.-]+", "-", name))
@@ -70,11 +65,10 @@ class Run:
         run = cls(path, plain(settings)).lock()
         require_free(path)  # nobody has taken it before the lock was ours
         write_json(path / "settings.json", signed(run.settings))
-        run._tensorboard = writer_class(str(path / "tensorboard")) if writer_class else None
         return run
 
     @classmethod
-    def open(cls, path: str | Path, *, tensorboard: bool = False, own: bool = False) -> Run:
+    def open(cls, path: str | Path, *, own: bool = False) -> Run:
         """An existing run folder. Raises ValueError where there is none, naming a near one, and for links
         inside it.
 
@@ -86,7 +80,7 @@ class Run:
         if not (path / "settings.json").is_file():
             raise ValueError(f"{path} is not a run folder: {why_not(path)}")
         refuse_links(path)
-        run = cls(path, {}, _summary_writer()(str(path / "tensorboard")) if tensorboard else None)
+        run = cls(path, {})
         if own:
             run.lock()
         try:
@@ -130,19 +124,14 @@ class Run:
         """
         return history.valid(self.checkpoints)
 
-    def record(self, step: int, seconds: float, values: dict[str, float]) -> None:
-        """Append the metrics of one update, and what the checkpoint before it took: every name must be
-        declared, floats that are not finite become null. Raises CannotWrite, as all that writes here.
+    def record(self, step: int, seconds: float, values: dict[str, float]) -> dict[str, float]:
+        """Append the metrics of one update, and what the checkpoint before it took; returns both. Every name
+        must be declared, floats that are not finite become null. Raises CannotWrite, as all that writes here.
         """
         values, self._costs = {**values, **self._costs}, {}
         metrics.check_names(values)
         self._append("metrics.jsonl", [{"step": step, "seconds": seconds, **values}])
-        if self._tensorboard is None:
-            return
-        for name, value in values.items():
-            if value is not None and math.isfinite(value):
-                self._tensorboard.add_scalar(name, float(value), step)
-        self._tensorboard.flush()
+        return values
 
     def record_episodes(self, rows: Iterable[dict[str, Any]]) -> None:
         """Append finished episodes, one object each (step, return, length, ...), in one write."""
@@ -151,6 +140,10 @@ class Run:
     def record_samples(self, rows: Iterable[dict[str, Any]]) -> None:
         """Append responses of a language model, one object each (step, prompt, response, scores, ...)."""
         self._append("samples.jsonl", rows)
+
+    def record_changes(self, rows: Iterable[dict[str, Any]]) -> None:
+        """Append changes of settings during the run, one object each (step, setting, value)."""
+        self._append("changes.jsonl", rows)
 
     def _append(self, name: str, rows: Iterable[dict[str, Any]]) -> None:
         text = "".join(dumps(row) + "\n" for row in rows)
@@ -171,6 +164,10 @@ class Run:
     def read_episodes(self) -> list[dict[str, Any]]:
         """The rows of episodes.jsonl so far; a line torn by a crash is left out."""
         return read_lines(self.path / "episodes.jsonl")
+
+    def read_changes(self) -> list[dict[str, Any]]:
+        """The rows of changes.jsonl so far; a line torn by a crash is left out."""
+        return read_lines(self.path / "changes.jsonl")
 
     def save(
         self,
@@ -318,8 +315,6 @@ class Run:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-        if self._tensorboard is not None:
-            self._tensorboard.close()
 
     def _close_files(self) -> None:
         for file in self._files.values():
@@ -333,14 +328,3 @@ class Run:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _summary_writer() -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ValueError(
-            "TensorBoard files are asked for, and the package tensorboard is not installed. "
-            "Install it with: pip install 'tightrope[tensorboard]', or leave --tensorboard away."
-        ) from error
-    return SummaryWriter

@@ -9,12 +9,8 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-import warnings
 from collections.abc import Iterator
-from pathlib import Path
 from types import FrameType
-
-from tightrope.runs import checkpoint
 
 
 class Stopped(KeyboardInterrupt):
@@ -78,37 +74,3 @@ def check() -> None:
     """Raise `Stopped` when a signal has come that someone's code has swallowed, or that came in `whole`."""
     if _answer.active and _answer.asked is not None and not _answer.saves:
         raise Stopped(_answer.asked)
-
-
-def farewell(error: BaseException, run: str | None, step: int, what: str, command: str) -> str:
-    """What to tell of a ``run`` (None: not begun) that was stopped at ``step``: its newest valid checkpoint,
-    what will be repeated, and the ``command`` that goes on. ``what`` is counted: steps, responses.
-    """
-    by = f" by {error}" if isinstance(error, Stopped) else ""
-    if run is None:
-        return f"Stopped{by} before the run began."
-    text = f"Stopped{by} at {what.removesuffix('s')} {step:,}. "
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of damaged ones the command that goes on will tell
-        folder = newest(run)
-    if folder is None:
-        text += f"There is no checkpoint yet: all {step:,} {what} will be repeated."
-    else:
-        saved = max(0, step - checkpoint.step_of(folder))
-        text += f"The newest valid checkpoint is {folder}; {saved:,} {what} since then will be repeated."
-    return f"{text} Go on with:\n  {command}"
-
-
-def newest(run: str) -> Path | None:
-    """The folder of a run's newest valid checkpoint; None where there is none."""
-    from tightrope.runs.run import Run  # which has its saves wrapped in `whole`
-
-    try:
-        return Run.open(run).newest().folder
-    except ValueError:
-        return None
-
-
-def code_of(error: BaseException) -> int:
-    """The exit code of a command that was stopped: 130 for Ctrl-C, 143 for SIGTERM."""
-    return error.code if isinstance(error, Stopped) else 130

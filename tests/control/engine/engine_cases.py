@@ -7,7 +7,7 @@ import torch
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser
 from tightrope.algorithms.settings import PPOSettings
-from tightrope.control.policies import Policy
+from tightrope.control.policy.policy import Policy
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import action_layout, observation_layout
 

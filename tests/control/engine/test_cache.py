@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import tightrope
-from tightrope.control.engine import cache, compiled
-from tightrope.control.engine.threads import Pace
+from tightrope.control.engine.compiled import cache
+from tightrope.control.engine.compiled.threads import ThreadChoice
 
 COMPILER = ("numba.np.linalg", "numba.np.arrayobj", "numba.np.random.generator_core", "numba.cpython.unicode")
 SOURCES = (str(Path(tightrope.__file__).parents[1]), str(Path(__file__).parent))
@@ -29,12 +29,13 @@ def memory():
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 before = memory()
-from tightrope.control.engine import FusedEngine, infer
+from tightrope.control.engine.compiled_engine import FusedEngine
+from tightrope.control.engine.compiled import infer
 needed = memory() - before
 import engine_cases
 x = np.arange(12, dtype=np.float32).reshape(3, 4)
 no, yes, out = np.zeros(x.shape, bool), np.ones(x.shape, bool), np.empty_like(x)
-infer.gae(x, x + 1, x + 2, no, no, yes, 0.99, 0.95, out)
+infer.gae_batch(x, x + 1, x + 2, no, no, yes, 0.99, 0.95, out)
 policy, optimiser, settings = engine_cases.make()
 batch, rng = engine_cases.make_batch(policy), np.random.default_rng(0)
 metrics = FusedEngine(policy, optimiser, 1).update(policy, optimiser, batch, settings, rng)
@@ -59,10 +60,10 @@ def start(caches):
 @pytest.fixture
 def warm(tmp_path):
     """A cache directory with a copy of all that is compiled."""
-    from tightrope.control.engine import fused  # noqa: F401  (compiles what is not there yet)
+    from tightrope.control.engine import compiled_engine  # noqa: F401  (compiles what is not there yet)
 
-    folder = compiled.cache_folder()
-    if folder is None or compiled.compilation_due():
+    folder = cache.cache_folder()
+    if folder is None or cache.compilation_due():
         pytest.skip("the cache is switched off")
     shutil.copytree(folder, tmp_path / "tightrope" / "numba" / folder.name)
     return tmp_path / "tightrope" / "numba" / folder.name
@@ -70,20 +71,20 @@ def warm(tmp_path):
 
 def test_cache_lies_in_the_users_cache_directory_and_is_private(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv(compiled.SWITCH, raising=False)
-    folder = compiled.cache_folder()
+    monkeypatch.delenv(cache.SWITCH, raising=False)
+    folder = cache.cache_folder()
     assert folder is not None and folder.parent == tmp_path / "tightrope" / "numba"
     assert folder.stat().st_mode & 0o777 == 0o700 and folder.parent.stat().st_mode & 0o777 == 0o700
-    assert compiled.compilation_due()
-    compiled.mark_complete()
-    assert not compiled.compilation_due()
+    assert cache.compilation_due()
+    cache.mark_complete()
+    assert not cache.compilation_due()
 
 
 @pytest.mark.parametrize("word", ["off", "OFF", "0"])
 def test_cache_can_be_switched_off(word, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv(compiled.SWITCH, word)
-    assert compiled.cache_folder() is None and compiled.compilation_due()
+    monkeypatch.setenv(cache.SWITCH, word)
+    assert cache.cache_folder() is None and cache.compilation_due()
     assert not list(tmp_path.iterdir())
 
 
@@ -95,14 +96,17 @@ def test_numbas_own_setting_is_left_alone():
 
 def test_a_warm_start_needs_no_compiler_and_little_memory(warm):
     _, memory, modules = start(warm.parents[2])
-    assert "tightrope.control.engine.update" in modules
+    assert "tightrope.control.engine.compiled.update" in modules
     assert not [name for name in (*COMPILER, "scipy.linalg") if name in modules]
-    assert memory < 130  # MB; about 80, and 50 more with all that numba needs for a compilation
+    assert memory < 130  # MB; about 90, and 40 more with all that numba needs for a compilation
 
 
 def test_damaged_and_foreign_entries_are_compiled_again_to_the_same_bits(warm):
     expected, _, _ = start(warm.parents[2])
-    entry, other = (warm / f"tightrope.control.engine.{name}" for name in ("infer.gae", "update.train"))
+    entry, other = (
+        warm / f"tightrope.control.engine.compiled.{name}"
+        for name in ("infer.gae_batch", "update.run_epochs")
+    )
     sound, data = entry.read_bytes(), bytearray(entry.read_bytes())
     data[len(data) // 2] ^= 1
     entry.write_bytes(data)
@@ -123,13 +127,13 @@ def test_what_is_no_entry_is_not_loaded(content, tmp_path):
         pass
 
     cache._file(tmp_path, function).write_bytes(content)
-    assert cache.load(tmp_path, function, lambda f: f) is None
+    assert cache.load_entry(tmp_path, function) is None
 
 
 def test_folders_long_out_of_use_are_removed(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv(compiled.SWITCH, raising=False)
-    root = compiled.cache_folder().parent
+    monkeypatch.delenv(cache.SWITCH, raising=False)
+    root = cache.cache_folder().parent
     ages = {"0" * 16: 100, "1" * 16: 80, "not-ours": 100, "2" * 16: 100}
     for name, days in ages.items():
         (root / name / "below").mkdir(parents=True)
@@ -137,13 +141,14 @@ def test_folders_long_out_of_use_are_removed(tmp_path, monkeypatch):
             (root / name / "complete").touch()
             os.utime(root / name / "complete", (time.time() - days * 86400,) * 2)
     os.utime(root / ("2" * 16), (time.time() - 100 * 86400,) * 2)
-    compiled.mark_complete()
-    assert {path.name for path in root.iterdir()} - {compiled.cache_folder().name} == {"1" * 16, "not-ours"}
+    cache.mark_complete()
+    assert {path.name for path in root.iterdir()} - {cache.cache_folder().name} == {"1" * 16, "not-ours"}
 
 
 def test_scipys_linear_algebra_is_whole_after_its_blas_was_taken_alone():
     code = (
-        "import tightrope.control.engine.compiled, scipy.linalg, scipy.linalg.cython_blas as b, numpy\n"
+        "import tightrope.control.engine.compiled.primitives\n"
+        "import scipy.linalg, scipy.linalg.cython_blas as b, numpy\n"
         "from scipy.linalg import cython_blas as c\n"
         "from numba.extending import get_cython_function_address as address\n"
         "assert b is c and address('scipy.linalg.cython_blas', 'dgemm')\n"
@@ -155,29 +160,29 @@ def test_scipys_linear_algebra_is_whole_after_its_blas_was_taken_alone():
 
 
 def test_wrong_arguments_are_refused():
-    from tightrope.control.engine import infer
+    from tightrope.control.engine.compiled import infer
 
     with pytest.raises(TypeError, match="No matching definition"):
-        infer.values(np.zeros(3), 1, 2, 3, 4, 5)
+        infer.value_batch(np.zeros(3), 1, 2, 3, 4, 5)
 
 
-def test_pace_takes_the_quicker_way_and_tries_the_other_again():
-    pace, seconds = Pace(both=True), {True: 3.0, False: 1.0}
+def test_choice_takes_the_quicker_way_and_tries_the_other_again():
+    choice, seconds = ThreadChoice(both=True), {True: 3.0, False: 1.0}
     choices = []
-    for _ in range(2 * Pace.RETRY):
-        choices.append(pace.choose())
-        pace.book(choices[-1], seconds[choices[-1]], 1)
+    for _ in range(2 * ThreadChoice.RETRY):
+        choices.append(choice.choose())
+        choice.record(choices[-1], seconds[choices[-1]], 1)
     assert choices[:2] == [True, False]
     assert sum(choices) == 2  # once to begin with, once to try again
     seconds[True] = 0.5
-    for _ in range(2 * Pace.RETRY):
-        last = pace.choose()
-        pace.book(last, seconds[last], 1)
+    for _ in range(2 * ThreadChoice.RETRY):
+        last = choice.choose()
+        choice.record(last, seconds[last], 1)
     assert last is True
 
 
-def test_pace_without_a_second_thread():
-    pace = Pace(both=False)
-    assert not pace.choose()
-    pace.book(False, 1.0, 1)
-    assert not pace.choose()
+def test_choice_without_a_second_thread():
+    choice = ThreadChoice(both=False)
+    assert not choice.choose()
+    choice.record(False, 1.0, 1)
+    assert not choice.choose()

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from tightrope.control.engine import dense
+from tightrope.control.engine.compiled import primitives
 
 
 def run(function, x):
@@ -25,16 +25,18 @@ def ulps(got, expected):
 @pytest.mark.parametrize(("name", "low", "high", "limit"), [("tanh", -12, 12, 6), ("exp", -87, 88.5, 2)])
 def test_accuracy(name, low, high, limit):
     x = np.linspace(low, high, 200_001).astype(np.float32)
-    assert ulps(run(getattr(dense, name), x), getattr(np, name)(x.astype(np.float64))) <= limit
+    assert ulps(run(getattr(primitives, name), x), getattr(np, name)(x.astype(np.float64))) <= limit
 
 
 def test_log_accuracy():
     x = np.geomspace(1e-30, 1e30, 200_001).astype(np.float32)
-    assert ulps(run(dense.log, x), np.log(x.astype(np.float64))) <= 3
+    assert ulps(run(primitives.log, x), np.log(x.astype(np.float64))) <= 3
 
 
 def test_special_numbers():
     x = np.array([np.nan, np.inf, -np.inf, 0.0], np.float32)
-    assert np.array_equal(run(dense.exp, x), np.array([np.nan, np.inf, 0, 1], np.float32), equal_nan=True)
-    assert np.allclose(run(dense.tanh, x), [np.nan, 1, -1, 0], equal_nan=True)
-    assert np.isnan(run(dense.log, x[:1])[0])
+    assert np.array_equal(
+        run(primitives.exp, x), np.array([np.nan, np.inf, 0, 1], np.float32), equal_nan=True
+    )
+    assert np.allclose(run(primitives.tanh, x), [np.nan, 1, -1, 0], equal_nan=True)
+    assert np.isnan(run(primitives.log, x[:1])[0])

@@ -7,7 +7,7 @@ import torch
 from engine_cases import difference, make, make_batch, numbers
 
 from tightrope.algorithms import ppo
-from tightrope.control.engine import FusedEngine
+from tightrope.control.engine.compiled_engine import FusedEngine
 
 
 def rng(seed):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from engine_cases import FEATURES, SPACES, make, make_masks, make_noise
 
-from tightrope.control.engine import FusedEngine
+from tightrope.control.engine.compiled_engine import FusedEngine
 from tightrope.maths import returns
 
 

@@ -12,8 +12,9 @@ import pytest
 from engine_cases import SPACES, difference, make, make_batch, numbers
 
 from tightrope.algorithms import ppo
-from tightrope.control.engine import FusedEngine, unsupported
-from tightrope.control.engine.threads import LEFT
+from tightrope.control.engine.compiled.plan import unsupported
+from tightrope.control.engine.compiled.threads import LEFT
+from tightrope.control.engine.compiled_engine import FusedEngine
 
 SETTINGS = {
     "defaults": {},
@@ -200,7 +201,7 @@ def test_the_process_ends_cleanly_right_after_an_update_with_two_threads():
     lines = [
         "import numpy as np",
         "from engine_cases import make, make_batch",
-        "from tightrope.control.engine import FusedEngine",
+        "from tightrope.control.engine.compiled_engine import FusedEngine",
         "policy, optimiser, settings = make()",
         "engine = FusedEngine(policy, optimiser, 2)",
         "engine.update(policy, optimiser, make_batch(policy), settings, np.random.default_rng(0))",

@@ -1,0 +1,196 @@
+"""Command line flags made from settings, one for each field, and suggestions for unknown flags."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any, NoReturn
+
+from tightrope.settings.fields import kinds, range_text
+from tightrope.settings.peer_names import PEER_NAMES
+
+WIDTH = 100
+
+
+class UsageError(ValueError):
+    """The command line is wrong; the message says how, and what was probably meant."""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argparse parser that raises UsageError instead of printing its usage and ending the process."""
+
+    def __init__(self, prog: str, usage: str, description: str, epilog: str | None = None) -> None:
+        super().__init__(
+            prog=prog,
+            usage=usage,
+            description=description,
+            epilog=epilog,
+            allow_abbrev=False,
+            formatter_class=_formatter,
+            argument_default=argparse.SUPPRESS,
+        )
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what argparse found."""
+        raise UsageError(message.removeprefix("argument "))
+
+    def flags(self) -> list[str]:
+        """Every long option, without its dashes."""
+        return [s[2:] for action in self._actions for s in action.option_strings if s.startswith("--")]
+
+    def read(
+        self, words: list[str], unknown: Callable[[str, list[str]], str] | None = None
+    ) -> dict[str, Any]:
+        """The options given, and only those. ``--num_envs`` is read as ``--num-envs``.
+
+        ``unknown(name, flags)`` gives the error text for an unknown flag (default: `unknown_flag`).
+        """
+        words = [with_dashes(word) for word in words]
+        known = self.flags()
+        for word in words:
+            name = word[2:].partition("=")[0]
+            if word.startswith("--") and name not in known:
+                raise UsageError((unknown or unknown_flag)(name, known))
+        self._refuse_repeated(words)
+        return vars(self.parse_args(words))
+
+    def _refuse_repeated(self, words: list[str]) -> None:
+        """UsageError for a flag that is given twice, on or off, unless its values are collected in a list."""
+        names = {s: action for action in self._actions for s in action.option_strings}
+        seen: dict[str, str] = {}
+        for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
+            action = names[flag]
+            if action.dest in seen and not isinstance(action, argparse._AppendAction):
+                both = flag if seen[action.dest] == flag else f"{seen[action.dest]} and {flag}"
+                raise UsageError(
+                    f"{both} was given twice, expected once: only the last would count. Leave one out."
+                )
+            seen[action.dest] = flag
+
+
+def _formatter(prog: str) -> argparse.HelpFormatter:
+    import shutil
+
+    width = min(WIDTH, shutil.get_terminal_size().columns)
+    return argparse.HelpFormatter(prog, max_help_position=28, width=max(40, width))
+
+
+def with_dashes(word: str) -> str:
+    """``--num_envs=8`` as ``--num-envs=8``; words that are no flags stay as they are."""
+    if not word.startswith("--"):
+        return word
+    name, equals, value = word.partition("=")
+    return name.replace("_", "-") + equals + value
+
+
+def nearest(word: str, choices: Iterable[str], cutoff: float = 0.6) -> str | None:
+    """The choice most like ``word``, or None when none is."""
+    import difflib
+
+    found = difflib.get_close_matches(word, list(choices), n=1, cutoff=cutoff)
+    return found[0] if found else None
+
+
+def unknown_flag(name: str, known: list[str]) -> str:
+    """The error text for an unknown flag, with a suggestion."""
+    meant = suggestion(name, known)
+    return f"There is no flag --{name}." + (
+        f" Did you mean --{meant}?" if meant else " --help lists them all."
+    )
+
+
+def suggestion(name: str, known: list[str]) -> str | None:
+    """The flag that was probably meant, without its dashes: another library's name, another spelling, or a
+    similar one; None when nothing is near.
+    """
+    negated, name = name.startswith("no-"), name.removeprefix("no-").replace("-", "_").lower()
+    british = name.replace("ize", "ise")
+    peer = PEER_NAMES.get(name) or PEER_NAMES.get(name.rstrip("_"))
+    meant = (british if british.replace("_", "-") in known else peer or "").replace("_", "-")
+    if meant and meant.split()[0] in known:
+        return f"no-{meant}" if negated and f"no-{meant}" in known else meant
+    return nearest(name.replace("_", "-"), known)
+
+
+def settings_fields(kind: type) -> dict[str, dataclasses.Field[Any]]:
+    """The fields of a settings class that are flags, by name."""
+    return {f.name: f for f in dataclasses.fields(kind) if f.init and f.name not in ("env", "update")}
+
+
+def add_fields(group: Any, kind: type, names: Iterable[str]) -> None:
+    """One option a field: its help is made from doc, range and default."""
+    fields = settings_fields(kind)
+    for name in names:
+        field, (plain, optional) = fields[name], kinds(kind)[name]
+        flag, text = "--" + name.replace("_", "-"), help_text(field, optional)
+        if plain is bool:
+            group.add_argument(
+                flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text
+            )
+        elif plain is tuple:
+            group.add_argument(flag, nargs="*", type=width, metavar="N", help=text)
+        else:
+            choices = field.metadata["choices"]
+            metavar = {str: "WORD", int: "N", float: "X"}[plain]
+            group.add_argument(flag, type=reader(plain, optional, choices), metavar=metavar, help=text)
+
+
+def help_text(field: dataclasses.Field[Any], optional: bool) -> str:
+    """``Discount per step. (0 < x <= 1; default 0.99)``."""
+    default = field.default
+    if default is None:
+        shown = "none"
+    elif isinstance(default, bool):
+        shown = "on" if default else "off"
+    elif isinstance(default, tuple):
+        shown = " ".join(str(item) for item in default)
+    else:
+        shown = f"{default:g}" if isinstance(default, float) else str(default)
+    limits = range_text(field.metadata)
+    if optional:
+        limits = f"{limits}, or none" if limits else "or none"
+    text = f"{field.metadata['doc']} ({limits + '; ' if limits else ''}default {shown})"
+    return text.replace("%", "%%")
+
+
+def reader(kind: type, optional: bool, choices: tuple[str, ...]) -> Callable[[str], Any]:
+    """A function from a word on the command line to a value of ``kind``; ``none`` where that is allowed."""
+
+    def read(word: str) -> Any:
+        if optional and word.lower() == "none":
+            return None
+        if choices and word not in choices:
+            near = nearest(word, choices)
+            raise argparse.ArgumentTypeError(
+                f"{word!r} is not one of: {', '.join(choices)}." + (f" Did you mean {near}?" if near else "")
+            )
+        try:
+            if kind is int:
+                return whole(word)
+            return kind(word)
+        except ValueError:
+            expected = {int: "a whole number", float: "a number"}[kind] + (" or none" if optional else "")
+            raise argparse.ArgumentTypeError(f"{word!r} is not {expected}.") from None
+
+    return read
+
+
+def width(word: str) -> int:
+    """One entry of a list of whole numbers. The error explains that the task comes before the list."""
+    try:
+        return whole(word)
+    except ValueError:
+        text = f"{word!r} is not a whole number. Give the task before this list: train ENV --hidden 64 64"
+        raise argparse.ArgumentTypeError(text) from None
+
+
+def whole(word: str) -> int:
+    """A whole number, also as 100_000 or 1e6. Raises ValueError."""
+    try:
+        return int(word)
+    except ValueError:
+        number = float(word)
+        if not number.is_integer():
+            raise
+        return int(number)

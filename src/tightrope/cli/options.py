@@ -1,0 +1,356 @@
+"""The options of each command, and the settings that a file and flags together give."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tightrope.cli.flags import (
+    Parser,
+    UsageError,
+    add_fields,
+    settings_fields,
+    suggestion,
+    unknown_flag,
+    whole,
+    with_dashes,
+)
+from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+from tightrope.language.settings import RECIPES, AlignSettings, ModelSettings, RewardSettings, SFTSettings
+from tightrope.runs.records import retyped
+from tightrope.settings.values import Settings, rule_of
+
+PROGRAM = "tightrope"
+
+# The groups of train --help; every setting is in one.
+GROUPS = {
+    "task": ("algorithm", "total_steps", "seed"),
+    "rollout": ("num_envs", "num_steps", "normalise_observations", "normalise_rewards"),
+    "networks": ("hidden", "activation", "shared", "std", "log_std_init", "gsde_steps", "squash"),
+    "update rule": (),
+    "evaluation and saving": (
+        "evaluate_every",
+        "evaluation_episodes",
+        "checkpoint_every",
+        "keep_checkpoints",
+        "tensorboard",
+    ),
+    "faults": ("on_env_fault", "max_env_restarts", "env_timeout", "max_rollbacks"),
+    "machine": ("vector_backend", "num_workers", "engine", "device", "threads", "compile"),
+}
+
+Options = dict[str, Any]
+KINDS: dict[str, type[Settings]] = {
+    "train": TrainSettings,
+    "sft": SFTSettings,
+    "reward": RewardSettings,
+    "align": AlignSettings,
+}
+NOT_SETTINGS = ("run_dir", "settings", "dry_run", "json", "quiet", "recipe", "env_module")
+# usage, description and the text below the options
+DESCRIPTIONS: dict[str, tuple[str, str, str | None]] = {
+    "train": (
+        "ENV",
+        "Train a policy on a Gymnasium task, and leave a run folder with everything about it.",
+        "Defaults shown are those of an unknown task; presets change some of them for the tasks they know. "
+        "--dry-run prints what holds. Each setting may be given after a settings file, too: the flag wins.",
+    ),
+    "sft": (
+        "--model M --data FILE",
+        "Fine-tune a causal language model on text, completions or chats.",
+        None,
+    ),
+    "reward": (
+        "--model M --data FILE",
+        "Train a reward model on pairs of a better and a worse text.",
+        None,
+    ),
+    "align": (
+        "--model M --data PROMPTS --reward R",
+        "PPO on a causal language model against any reward.",
+        "Recipes: " + "; ".join(f"{name} ({recipe.source})" for name, recipe in RECIPES.items()),
+    ),
+}
+# the setting by which the settings.json of a command is recognised
+OWN_FIELDS = {"sft": "on_completions", "reward": "demonstrations", "align": "max_new_tokens", "train": "env"}
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """A line of JSON on standard output: what --json promises, numbers that JSON cannot hold as null."""
+    from tightrope.runs.records import dumps
+
+    print(dumps(value), flush=True)
+
+
+def output(parser: Parser) -> None:
+    """The options about what is printed, which every command has."""
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "--json", action="store_true", help="Last line of stdout: one JSON object; the rest on stderr."
+    )
+    group.add_argument("--quiet", action="store_true", help="Print the end only.")
+
+
+def dry_run(settings: Settings, given: Options) -> bool:
+    """Whether --dry-run was given; then the settings are printed."""
+    if given.get("dry_run"):
+        print(json.dumps(settings.to_json(), indent=None if given.get("json") else 2))
+    return bool(given.get("dry_run"))
+
+
+def _common(parser: Parser, *, run: bool) -> None:
+    """The options that several commands have."""
+    output(parser)
+    group = parser.add_argument_group("code of your own")
+    group.add_argument(
+        "--env-module",
+        metavar="FILE.py",
+        help="Python file or module to import first: it registers environments (default: none).",
+    )
+    if run:
+        group.add_argument(
+            "--env",
+            metavar="ID",
+            help="The task again; needed where its id names a module (default: the run's own).",
+        )
+
+
+def training_parser(command: str, algorithm: str = "ppo") -> Parser:
+    """The options of a command that trains; those of ``train`` with this update rule."""
+    usage, description, epilog = DESCRIPTIONS[command]
+    kind = KINDS[command]
+    parser = Parser(f"{PROGRAM} {command}", f"%(prog)s {usage} [options]", description, epilog)
+    if command == "train":
+        parser.add_argument("env", nargs="?", metavar="ENV", help="Gymnasium id, like CartPole-v1.")
+    for title, names in _groups(command).items():
+        rule = rule_of(kind, algorithm) if title == "update rule" else None
+        if rule is None:
+            add_fields(parser.add_argument_group(title), kind, names)
+        else:
+            others = ", ".join(name for name in ALGORITHM_SETTINGS if name != algorithm)
+            hint = f"For those of {others}: --algorithm NAME --help." if command == "train" else None
+            group = parser.add_argument_group(f"update rule: {algorithm}", hint)
+            add_fields(group, rule, settings_fields(rule))
+    folder = "ENV-ALGORITHM-SEED-TIME" if command == "train" else "COMMAND-MODEL-TIME"
+    group = parser.add_argument_group("run")
+    group.add_argument("--run-dir", metavar="FOLDER", help=f"Where the run lies (default runs/{folder}).")
+    group.add_argument(
+        "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
+    )
+    group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
+    if command == "train":
+        _common(parser, run=False)
+    else:
+        output(parser)
+    if command == "align":
+        parser.add_argument_group("recipes and judges").add_argument(
+            "--recipe", choices=tuple(RECIPES), metavar="NAME", help=f"One of: {', '.join(RECIPES)}."
+        )
+    return parser
+
+
+def _groups(command: str) -> Mapping[str, Iterable[str]]:
+    """The titles of --help and the settings under each."""
+    if command == "train":
+        return GROUPS
+    shared = settings_fields(ModelSettings)
+    first = [name for name in settings_fields(KINDS[command]) if name not in shared]
+    if command == "align":
+        return {"alignment": first, "update rule": (), "model and machine": shared}
+    return {"data and training": first, "model and machine": shared}
+
+
+def run_parser(
+    command: str, description: str, folder: str = "Run folder, or a folder that agent.save wrote."
+) -> Parser:
+    """The beginning of a command about a run: its name, and the argument RUN with ``folder`` as its help."""
+    parser = Parser(f"{PROGRAM} {command}", "%(prog)s RUN [options]", description)
+    parser.add_argument("run", metavar="RUN", help=folder)
+    return parser
+
+
+def evaluate_parser() -> Parser:
+    """The options of ``evaluate``."""
+    parser = run_parser(
+        "evaluate", "Play episodes with the saved policy of a run: mean return, deviation, 95 % interval."
+    )
+    group = parser.add_argument_group("evaluation")
+    group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 100).")
+    group.add_argument(
+        "--stochastic", action="store_true", help="Sample actions; default: the most likely one."
+    )
+    group.add_argument("--best", action="store_true", help="The policy that evaluated best, not the newest.")
+    group.add_argument(
+        "--seed", type=_not_negative, metavar="N", help="Seed of the episodes (default: fixed, unused)."
+    )
+    group.add_argument("--device", metavar="WORD", help="Torch device of the networks (default cpu).")
+    _common(parser, run=True)
+    return parser
+
+
+def record_parser() -> Parser:
+    """The options of ``record``."""
+    parser = run_parser("record", "Write an mp4 of the saved policy of a run; no display is needed.")
+    group = parser.add_argument_group("recording")
+    group.add_argument("--out", metavar="FILE.mp4", help="Where to (default RUN/videos/).")
+    group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 1).")
+    group.add_argument("--best", action="store_true", help="The policy that evaluated best, not the newest.")
+    group.add_argument(
+        "--seed",
+        type=_not_negative,
+        metavar="N",
+        help="Seed of the episodes (default: fixed, unused in training).",
+    )
+    _common(parser, run=True)
+    return parser
+
+
+def resume_parser() -> Parser:
+    """The options of ``resume``."""
+    parser = run_parser(
+        "resume", "Go on with a run from its newest checkpoint, in the same folder.", "Run folder."
+    )
+    group = parser.add_argument_group("going on")
+    group.add_argument(
+        "--total-steps",
+        type=at_least_one,
+        metavar="N",
+        help="A new end (align: responses); also continues a finished run (default: the run's own).",
+    )
+    group.add_argument(
+        "--reward",
+        metavar="R",
+        help="align: the reward again, where it was your own code (default: the run's).",
+    )
+    group.add_argument(
+        "--gold",
+        metavar="R",
+        help="align: the gold judge again, where it was your own code (default: the run's).",
+    )
+    group.add_argument(
+        "--data",
+        metavar="FILE",
+        help="Language: the data again, where they were no file, or lie elsewhere (default: the run's).",
+    )
+    _common(parser, run=True)
+    return parser
+
+
+def at_least_one(word: str) -> int:
+    """A whole number above 0, as argparse reads it."""
+    return _bounded(word, 1)
+
+
+def _not_negative(word: str) -> int:
+    return _bounded(word, 0)
+
+
+def _bounded(word: str, low: int) -> int:
+    try:
+        number = whole(word)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{word!r} is not a whole number.") from None
+    if number < low:
+        raise argparse.ArgumentTypeError(f"{number} is too small; expected at least {low}.")
+    return number
+
+
+def training_options(command: str, words: list[str]) -> tuple[Options, Options]:
+    """The options given, and the value of each setting that --settings, --recipe or a flag names. Flags win
+    over the recipe, the recipe over the file.
+    """
+    words = [with_dashes(word) for word in words]
+    path = _value_of("--settings", words)
+    of_file = _values_of_file(command, path) if path else {}
+    algorithm = "ppo"
+    if command == "train":
+        algorithm = _value_of("--algorithm", words) or of_file.get("algorithm", "ppo")
+    if algorithm not in ALGORITHM_SETTINGS:
+        algorithm = "ppo"  # the parser words the error
+
+    def unknown(name: str, known: list[str]) -> str:
+        return _unknown_setting(name, known, algorithm) if command == "train" else unknown_flag(name, known)
+
+    given = training_parser(command, algorithm).read(words, unknown)
+    if of_file.get("algorithm", algorithm) != algorithm:  # the settings of another update rule do not fit
+        outer = settings_fields(TrainSettings).keys() | {"env"}
+        of_file = {name: value for name, value in of_file.items() if name in outer}
+    recipe = RECIPES[given["recipe"]].values if "recipe" in given else {}
+    flags = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in given.items()
+        if name not in NOT_SETTINGS
+    }
+    for name, value in of_file.items():
+        if name not in flags:
+            _refuse_code(command, str(path), name, value)
+    return given, {**of_file, **recipe, **flags}
+
+
+def _value_of(flag: str, words: list[str]) -> str | None:
+    for i, word in enumerate(words):
+        if word.startswith(flag + "="):
+            return word.partition("=")[2]
+        if word == flag and i + 1 < len(words):
+            return words[i + 1]
+    return None
+
+
+def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
+    """The error text for an unknown flag of train. It names the update rule that has the flag, if one has."""
+    own = " ".join("--" + field.replace("_", "-") for field in settings_fields(ALGORITHM_SETTINGS[algorithm]))
+    for other, kind in ALGORITHM_SETTINGS.items():
+        flags = [field.replace("_", "-") for field in settings_fields(kind)]
+        meant = name.removeprefix("no-") if name.removeprefix("no-") in flags else None
+        if meant is None and suggestion(name, known) is None:
+            meant = suggestion(name, flags)
+        if meant is not None and meant not in known:
+            seen = "" if meant == name.removeprefix("no-") else f"There is no flag --{name}; "
+            return (
+                f"{seen}--{meant} is a setting of {other}, not of {algorithm}. Settings of {algorithm}: {own}"
+            )
+    return unknown_flag(name, known)
+
+
+def read_settings(path: str) -> Any:
+    """What a settings.json holds, given as a file or as the folder of a run. UsageError if there is none."""
+    from tightrope.runs.records import read_json
+    from tightrope.runs.signed import unsigned
+
+    file = Path(path)
+    file = file / "settings.json" if file.is_dir() else file
+    if not file.is_file():
+        raise UsageError(f"--settings {path}: there is no such file. Give RUN/settings.json.")
+    found = read_json(file)
+    return unsigned(found) if isinstance(found, dict) else found
+
+
+def _values_of_file(command: str, path: str) -> Options:
+    """The values in a settings file, names and types checked. UsageError for those of another command."""
+    data = read_settings(path)
+    fields = data if isinstance(data, dict) else {}
+    other = next((name for name, field in OWN_FIELDS.items() if field in fields), command)
+    if other != command:
+        raise UsageError(
+            f"--settings {path} holds the settings of {other}, expected those of {command}. Give "
+            f"settings.json of a run of {command}, or type: {PROGRAM} {other} --settings {path}"
+        )
+    return KINDS[command].values_from_json(data, f"--settings {path}")
+
+
+def _refuse_code(command: str, path: str, name: str, value: Any) -> None:
+    """UsageError for a value that only the user may give: a Python object or code."""
+    judge = name in ("reward", "gold") and value not in (None, "", "length") and not Path(value).is_dir()
+    module = name == "env" and ":" in value
+    if judge or module or (isinstance(value, str) and value.startswith("<")):
+        word = "FILE.py:function" if name in ("reward", "gold") else "ID" if name == "env" else "FILE"
+        flag = "" if name == "env" else f"--{name.replace('_', '-')} "
+        raise UsageError(
+            f"--settings {path}: {name} was {value!r}, which no file may name: an object, code, or a "
+            f"folder that is gone. Give it again: {PROGRAM} {command} --settings {shlex.quote(path)} "
+            f"{flag}{retyped(value, word)}"
+        )

@@ -1,0 +1,1 @@
+"""Copies of a task behind reset and step."""

@@ -1,0 +1,187 @@
+"""What steps B environments: the interface, what a step returns, and the arrays that it is written to."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tightrope.control.environments.faults import FaultPolicy, Restarts
+from tightrope.control.spaces import ActionLayout, Inputs, ObservationLayout
+
+
+class Step(NamedTuple):
+    """What one step of all B environments returned; rewards and flags are valid until the next step."""
+
+    inputs: Inputs  # what the next action is chosen from
+    action_mask: np.ndarray | None  # bool [B, L], for the next action
+    rewards: np.ndarray  # float64 [B]
+    terminated: np.ndarray  # bool [B]
+    truncated: np.ndarray  # bool [B]; never True where terminated is
+    phantom: np.ndarray | None = (
+        None  # bool [B]: NEXT_STEP's reset, not a transition; None: none in this step
+    )
+    final_rows: np.ndarray | None = None  # int [F]: truncated rows whose ``inputs`` are the next episode's
+    final_inputs: Inputs | None = None  # [F, ...]: the true last observations of these rows
+    cut: np.ndarray | None = None  # bool [B]: restarted after a fault; this step did not take place there
+
+
+@dataclass(frozen=True, eq=False)
+class StepBuffers:
+    """The arrays that N environments read their actions from and write their steps to, a row each.
+
+    Allocated once; shared memory where worker processes step the environments.
+    """
+
+    inputs: Inputs
+    final_inputs: Inputs
+    actions: np.ndarray  # float32 [N, A], already squashed where that was asked for
+    rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    masks: np.ndarray  # bool [N, L]
+    cut: np.ndarray  # bool [N]: restarted in this step
+    restarts: np.ndarray  # int64 [N]: since all were reset
+    current: np.ndarray  # int64 [N]: in the first place of a group the row that it is stepping, else -1
+
+    @classmethod
+    def allocate(
+        cls,
+        num: int,
+        observations: ObservationLayout,
+        actions: ActionLayout,
+        zeros: Callable[..., Any] = np.zeros,
+    ) -> StepBuffers:
+        """Buffers for ``num`` environments; ``zeros(shape, dtype)`` makes each array."""
+        return cls(
+            inputs=observations.allocate(num, zeros),
+            final_inputs=observations.allocate(num, zeros),
+            actions=zeros((num, actions.num_columns), np.float32),
+            rewards=zeros((num,), np.float64),
+            terminated=zeros((num,), np.bool_),
+            truncated=zeros((num,), np.bool_),
+            masks=zeros((num, actions.num_logits), np.bool_),
+            cut=zeros((num,), np.bool_),
+            restarts=zeros((num,), np.int64),
+            current=zeros((num,), np.int64),
+        )
+
+    def map(self, function: Callable[[Any], Any]) -> StepBuffers:
+        """The same buffers with ``function`` applied to each array."""
+
+        def mapped(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {name: function(array) for name, array in value.items()}
+            return function(value)
+
+        return StepBuffers(**{field.name: mapped(getattr(self, field.name)) for field in fields(self)})
+
+    def step(self, has_masks: bool) -> Step:
+        """A copy of what the last step left here."""
+        rows = np.flatnonzero(self.truncated) if self.truncated.any() else None
+        return Step(
+            inputs={name: array.copy() for name, array in self.inputs.items()},
+            action_mask=self.masks.copy() if has_masks else None,
+            rewards=self.rewards.copy(),
+            terminated=self.terminated.copy(),
+            truncated=self.truncated.copy(),
+            final_rows=rows,
+            final_inputs=None if rows is None else {k: array[rows] for k, array in self.final_inputs.items()},
+            cut=self.cut.copy() if self.cut.any() else None,
+        )
+
+
+class Environments(ABC):
+    """B environments of one task. Made by ``make_environments``; close it, or use it in a ``with`` statement.
+
+    After an EnvironmentFault only ``close`` is allowed. ``row_groups``: slices of rows, in the order in which
+    to choose their actions, so that choosing the next overlaps with stepping the last.
+    """
+
+    backend: str  # "serial" | "workers" | "vector" | "envpool" | "given"
+    spec_id: str
+    max_episode_steps: int | None
+    num_workers: int = 1
+    squash: bool = False
+    gives_state: bool  # whether the environments can give their state (see state.py)
+    num_envs: int
+    observation_layout: ObservationLayout
+    action_layout: ActionLayout
+    row_groups: tuple[slice, ...]
+
+    def __init__(self, policy: FaultPolicy) -> None:
+        self.policy = policy
+        self._restarts = Restarts(policy)
+
+    @property
+    def restarts(self) -> int:
+        """How often an environment, or a process of them, was restarted after a fault."""
+        return self._restarts.count
+
+    @abstractmethod
+    def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
+        """Reset all: the first inputs and action masks.
+
+        Single environment i gets the seed ``seed + i``, a vector environment ``seed``.
+        """
+
+    def step(self, actions: np.ndarray) -> Step:
+        """Act in every environment; ``actions`` [B, A] float32 as sampled, bounds are handled here."""
+        for rows in self.row_groups:
+            self.send(rows, actions[rows])
+        return self.receive()
+
+    def send(self, rows: slice, actions: np.ndarray) -> None:
+        """Hand over the actions of one row group; worker processes begin to step at once."""
+        self._send(rows, self.action_layout.squashed(actions) if self.squash else actions)
+
+    @abstractmethod
+    def _send(self, rows: slice, actions: np.ndarray) -> None: ...
+
+    @abstractmethod
+    def receive(self) -> Step:
+        """Finish the step; the actions of every row group must have been sent, in order."""
+
+    @abstractmethod
+    def get_state(self) -> dict[str, Any]:
+        """The state in the middle of episodes, as JSON can hold it; EnvironmentFault when it cannot."""
+
+    def set_state(self, state: dict[str, Any]) -> tuple[Inputs, np.ndarray | None]:
+        """Reset, and continue from what `get_state` returned; returns what the reset did.
+
+        ValueError for a seed that no run has.
+        """
+        seed = state["seed"]
+        if not isinstance(seed, int) or not 0 <= seed < 2**63:
+            raise ValueError(f"the seed of the episodes is {str(seed)[:80]}")
+        first = self.reset(seed)
+        self._set_state(state)
+        return first
+
+    @abstractmethod
+    def _set_state(self, state: dict[str, Any]) -> None: ...
+
+    def count_from(self, restarts: int) -> None:
+        """Start the restart counter at ``restarts``."""
+        self._restarts.count = restarts
+
+    def worker_of(self, row: int) -> int:
+        """The number of the worker process that steps a row; 0: this process."""
+        return 0
+
+    @abstractmethod
+    def seed_of(self, row: int) -> int:
+        """The seed of a row's last seeded reset."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close every environment that was made here and end the workers; closing twice is fine."""
+
+    def __enter__(self) -> Environments:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

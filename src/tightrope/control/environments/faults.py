@@ -1,0 +1,249 @@
+"""Faults of environments: how they are described, checked for, and answered by a restart.
+
+An `EnvironmentFault` names the environment, its process, the step, the seed and the action, and includes the
+traceback of the environment's own error. A `FaultPolicy` decides whether the run ends or the environment is
+restarted. `Restarts` is the one loop that restarts, for single environments, processes and vector
+environments.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
+LONGEST_PAUSE = 2.0
+Result = TypeVar("Result")
+
+
+class EnvironmentFault(RuntimeError):
+    """An environment raised, hung or broke Gymnasium's API, or its process died.
+
+    ``index``: which environment (-1: unknown). ``step``: since all were reset. ``worker``: its process (0:
+    this one). ``seed``: of its last seeded reset. ``action``: its last one, as text. ``lost``: its process is
+    gone or does not answer.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        index: int = -1,
+        step: int = -1,
+        *,
+        env_id: str = "",
+        worker: int = 0,
+        seed: int | None = None,
+        action: str | None = None,
+        lost: bool = False,
+    ) -> None:
+        super().__init__(message)
+        self.index = index
+        self.step = step
+        self.env_id = env_id
+        self.worker = worker
+        self.seed = seed
+        self.action = action
+        self.lost = lost
+
+    def record(self) -> dict[str, Any]:
+        """The arguments, as JSON, from which another process can build this fault again."""
+        names = ("index", "step", "env_id", "worker", "seed", "action")
+        return {"message": str(self), **{name: getattr(self, name) for name in names}}
+
+
+class ApiBreak(Exception):
+    """An environment returned what Gymnasium's API does not allow; becomes an EnvironmentFault.
+
+    ``index``: the row of a vector environment that did (-1: all, or unknown).
+    """
+
+    def __init__(self, message: str, index: int = -1) -> None:
+        super().__init__(message)
+        self.index = index
+
+
+class Overdue(BaseException):
+    """An environment of this process exceeded its time limit.
+
+    A BaseException, so that the environment's own ``except Exception`` does not swallow it.
+    """
+
+
+# what counts as an environment's fault; a signal to this process does not
+RAISED = (Exception, SystemExit, GeneratorExit, Overdue)
+
+
+class FaultPolicy(NamedTuple):
+    """What happens after a fault: the settings on_env_fault, max_env_restarts and env_timeout."""
+
+    restart: bool = False
+    max_restarts: int = 0
+    timeout: float | None = 60.0
+
+
+def policy_of(settings: Any) -> FaultPolicy:
+    """The policy that a run's settings ask for."""
+    return FaultPolicy(settings.on_env_fault == "restart", settings.max_env_restarts, settings.env_timeout)
+
+
+# ------------------------------------------------------------------------------------------------- restarts
+
+
+class Restarts:
+    """Counts restarts, and restarts until it works or the policy's limit is reached."""
+
+    def __init__(self, policy: FaultPolicy) -> None:
+        self.policy = policy
+        self.count = 0
+
+    def until_it_works(
+        self,
+        fault: EnvironmentFault,
+        attempt: Callable[[], Result],
+        explain: Callable[[BaseException], EnvironmentFault],
+    ) -> Result:
+        """What ``attempt`` returns, called again after each fault of its own.
+
+        ``explain`` turns what ``attempt`` raised into a fault, or raises. Raises the last fault when the
+        limit is reached.
+        """
+        while True:
+            if self.count >= self.policy.max_restarts:
+                raise self.given_up(fault) from fault.__cause__
+            self.count += 1
+            try:
+                return attempt()
+            except RAISED as error:
+                fault = explain(error)
+
+    def given_up(self, fault: EnvironmentFault) -> EnvironmentFault:
+        """The fault that ends the run when the limit is reached."""
+        message = (
+            f"{fault}\nEnvironments were restarted {self.count} times; max_env_restarts allows no more. Fix "
+            "the environment, or allow more."
+        )
+        return EnvironmentFault(**{**fault.record(), "message": message})
+
+
+def restart_seed(seed: int, restarts: int, index: int) -> int:
+    """The seed of environment ``index`` after its n-th restart since all were reset with ``seed``."""
+    return int(np.random.SeedSequence([seed, restarts, index]).generate_state(1)[0])
+
+
+def seed_of(seed: int, restarts: int, index: int) -> int:
+    """The seed of environment ``index``: ``seed + index`` until its first restart."""
+    return restart_seed(seed, restarts, index) if restarts else seed + index
+
+
+def pause(restarts: int, timeout: float | None) -> float:
+    """Seconds to wait before the n-th restart; well below the time limit."""
+    longest = LONGEST_PAUSE if timeout is None else min(LONGEST_PAUSE, timeout / 4)
+    return min(longest, FIRST_PAUSE * 2.0 ** min(restarts - 1, 20))
+
+
+def wait_before_restart(restarts: int, policy: FaultPolicy) -> None:
+    """Sleep for `pause`."""
+    time.sleep(pause(restarts, policy.timeout))
+
+
+# ------------------------------------------------------------------------------------------------- messages
+
+
+def explained(
+    error: BaseException,
+    who: str,
+    index: int,
+    step: int,
+    *,
+    env_id: str,
+    worker: int,
+    seed: int | None,
+    action: str | None,
+    advice: str = "",
+) -> EnvironmentFault:
+    """The fault for what ``who`` raised; an error of the environment's own brings its traceback."""
+    api = isinstance(error, ApiBreak)
+    if isinstance(error, Overdue):
+        what = f"was {error}"
+    elif api or raised_here(error):
+        what = f"does not follow Gymnasium's API: {error}"
+    else:
+        what = f"raised {type(error).__name__}: {error}"
+    message = f"{who} at step {step} {what}{circumstances(worker, seed, action)}{advice}"
+    if not api:
+        message += "\n" + "".join(traceback.format_exception(error)).rstrip()
+    fault = EnvironmentFault(message, index, step, env_id=env_id, worker=worker, seed=seed, action=action)
+    fault.__cause__ = error
+    return fault
+
+
+def circumstances(worker: int, seed: int | None, action: str | None) -> str:
+    """`` (worker 2, seed 7, last action 1)``."""
+    who = f"worker {worker}" if worker else "in this process"
+    return f" ({who}, seed {seed}, {'no action yet' if action is None else f'last action {action}'})"
+
+
+def action_text(action: Any) -> str:
+    """An action in at most 80 characters."""
+    text = " ".join(str(action).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def raised_here(error: BaseException) -> bool:
+    """Whether this library raised it, because it could not use what an environment returned."""
+    frames = traceback.extract_tb(error.__traceback__)
+    control = Path(__file__).parents[1]
+    return bool(frames) and control in Path(frames[-1].filename).parents
+
+
+def describe(value: Any) -> str:
+    """A value in a few words for an error message."""
+    if isinstance(value, tuple):
+        return f"a tuple of {len(value)} values"
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    return f"a {type(value).__name__}"
+
+
+# --------------------------------------------------------------------------------------------------- checks
+
+
+def check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
+    """The pair (observation, info) that ``reset`` returned; ApiBreak when it is something else."""
+    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
+        raise ApiBreak(
+            f"reset returned {describe(result)}, expected the pair (observation, info dict). "
+            "Environments of the old gym API must be ported to Gymnasium 1.x"
+        )
+    return result
+
+
+def check_step(result: Any) -> None:
+    """Check the first step of an environment; ApiBreak names what it returned and what was expected."""
+    if not isinstance(result, tuple) or len(result) != 5:
+        raise ApiBreak(
+            f"step returned {describe(result)}, expected five values: observation, reward, terminated, "
+            "truncated, info. Environments of the old gym API (four values) must be ported to Gymnasium 1.x"
+        )
+    _, reward, terminated, truncated, info = result
+    if isinstance(reward, str | bytes | None) or np.ndim(reward) != 0:
+        raise ApiBreak(f"the reward is {reward!r}, expected one number")
+    for name, flag in (("terminated", terminated), ("truncated", truncated)):
+        if not isinstance(flag, bool | np.bool_ | int):
+            raise ApiBreak(f"{name} is {flag!r}, expected True or False")
+    if not isinstance(info, dict):
+        raise ApiBreak(f"info is {describe(info)}, expected a dict")
+
+
+def check_finite(what: str, numbers: Any) -> None:
+    """ApiBreak for the first NaN or infinity."""
+    good = np.isfinite(numbers)
+    if not good.all():
+        index = tuple(int(i) for i in np.argwhere(~good)[0])
+        place = f" at index {', '.join(map(str, index))}" if index else ""
+        raise ApiBreak(f"{what} = {np.asarray(numbers)[index]}{place}, expected finite numbers")

@@ -1,0 +1,291 @@
+"""Several environments stepped one after the other in one process.
+
+Each is reset in the step in which its episode ends, so that no row is ever wasted; the true final observation
+of a truncated episode is kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from tightrope.control.environments import state as states
+from tightrope.control.environments.base import StepBuffers
+from tightrope.control.environments.faults import (
+    RAISED,
+    ApiBreak,
+    EnvironmentFault,
+    FaultPolicy,
+    Restarts,
+    action_text,
+    check_finite,
+    check_reset,
+    check_step,
+    explained,
+    seed_of,
+    wait_before_restart,
+)
+from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, check_first_step, find_source
+from tightrope.control.environments.tasks import check_alike, make_all
+from tightrope.control.spaces import Inputs, action_layout, observation_layout
+
+
+class EnvGroup:
+    """Environments that write their steps straight into their rows of the buffers.
+
+    ``first``: index of the first among all of the run. ``makers``: one function per environment, for a policy
+    that restarts it after a fault. ``worker``: number of this process, 0 for the main one.
+    """
+
+    def __init__(
+        self,
+        envs: Sequence[gym.Env],
+        buffers: StepBuffers,
+        name: str,
+        first: int = 0,
+        *,
+        makers: Sequence[Callable[[], gym.Env]] = (),
+        policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
+        worker: int = 0,
+    ) -> None:
+        self.envs = list(envs)
+        self.buffers = buffers
+        self.name = name
+        self.first = first
+        self.worker = worker
+        self.makers = makers
+        self.policy = policy
+        self.restarts = Restarts(policy)
+        self.observation_layout = observation_layout(envs[0].observation_space)
+        self.action_layout = action_layout(envs[0].action_space)
+        self.has_masks = False
+        self._mask_sources = [MaskSource()] * len(envs)
+        self._shape = envs[0].observation_space.shape
+        self._plain = self.observation_layout.plain
+        self._rows = [{k: a[i : i + 1] for k, a in buffers.inputs.items()} for i in range(len(envs))]
+        self._finals = [{k: a[i : i + 1] for k, a in buffers.final_inputs.items()} for i in range(len(envs))]
+        self._flat_rows = [row["flat"][0] for row in self._rows] if self._plain else []
+        self._seed = 0
+        self._count = 0  # steps since the last reset of all
+        self._calls = 0  # steps and resets that have begun
+        self._checked = False  # the first step is checked closely
+        self._dirty = True  # a flag may be set
+        buffers.current.fill(-1)
+
+    def reset(self, seed: int) -> None:
+        """Reset all; environment i (counted over all groups) gets the seed ``seed + i``."""
+        self._seed = seed
+        self._count = 0
+        self._checked = False
+        self._dirty = True
+        self.buffers.masks.fill(True)
+        self.buffers.cut.fill(False)
+        try:
+            for row in range(len(self.envs)):
+                try:
+                    self._begin(row)
+                except RAISED as error:
+                    self._restart(row, error)
+            self._check_masks()
+        finally:
+            self.buffers.current[0] = -1
+
+    def step(self) -> None:
+        """Step each with its row of ``buffers.actions``; one whose episode ends is reset at once."""
+        if self._dirty:
+            for flags in (self.buffers.terminated, self.buffers.truncated, self.buffers.cut):
+                flags.fill(False)
+            self._dirty = False
+        self._count += 1
+        self._calls += 1
+        actions = self.action_layout.rows(self.buffers.actions)
+        row = 0
+        try:
+            while row < len(self.envs):
+                row = self._step_from(row, actions)
+            self._checked = True
+            self._check_masks()
+        finally:
+            self.buffers.current[0] = -1
+
+    def call_number(self) -> int | None:
+        """A number that changes with every call of an environment; None between calls."""
+        row = int(self.buffers.current[0])
+        return None if row < 0 else self._calls * len(self.envs) + row
+
+    def _begin(self, row: int) -> None:
+        """Reset one environment with its seed."""
+        self._calls += 1
+        self.buffers.current[0] = row
+        observation, info = check_reset(self.envs[row].reset(seed=self._seed_of(row)))
+        self._plain &= isinstance(observation, np.ndarray)
+        self.observation_layout.write(observation, self._rows[row])
+        if self.policy.restart:
+            self._check_row(self._rows[row], "observation")
+        self._find_mask(row, info)
+        if self.has_masks:
+            self._store_mask(row, observation, info)
+
+    def _step_from(self, begin: int, actions: Iterator[Any]) -> int:
+        """Step from row ``begin`` on; the row to continue from, behind one that was restarted."""
+        # local names: this loop is the cost of every step
+        buffers, plain, shape, checked = self.buffers, self._plain, self._shape, self._checked
+        envs, rewards, flat_rows, current = self.envs, buffers.rewards, self._flat_rows, buffers.current
+        has_masks, strict = self.has_masks, self.policy.restart
+        row = begin
+        try:
+            for row, action in zip(range(begin, len(self.envs)), actions, strict=False):
+                current[0] = row
+                result = envs[row].step(action)
+                if not checked:
+                    check_step(result)
+                    check_first_step(result[4], has_masks)
+                observation, reward, terminated, truncated, info = result
+                rewards[row] = reward
+                if strict:
+                    check_finite("reward", rewards[row])
+                if terminated or truncated:
+                    observation, info = self._end(row, observation, terminated)
+                if plain:
+                    if observation.shape != shape:
+                        raise ApiBreak(
+                            f"the observation has shape {observation.shape}, the space says {shape}"
+                        )
+                    flat_rows[row][...] = observation
+                else:
+                    self.observation_layout.write(observation, self._rows[row])
+                if strict:
+                    self._check_row(self._rows[row], "observation")
+                if has_masks:
+                    self._store_mask(row, observation, info)
+        except RAISED as error:
+            self._restart(row, error)
+            return row + 1
+        return len(self.envs)
+
+    def _end(self, row: int, observation: Any, terminated: bool) -> tuple[Any, dict[str, Any]]:
+        """Record how the episode ended, keep a truncation's last observation, and reset."""
+        self._dirty = True
+        if terminated:
+            self.buffers.terminated[row] = True
+        else:
+            self.observation_layout.write(observation, self._finals[row])
+            if self.policy.restart:
+                self._check_row(self._finals[row], "final observation")
+            self.buffers.truncated[row] = True
+        observation, info = self.envs[row].reset()
+        return observation, info
+
+    @staticmethod
+    def _check_row(inputs: Inputs, what: str) -> None:
+        if "flat" in inputs:
+            check_finite(what, inputs["flat"][0])
+
+    # ------------------------------------------------------------------------------------------------- masks
+
+    def _find_mask(self, row: int, info: dict[str, Any]) -> None:
+        source = find_source(self.envs[row], info, self.observation_layout, self.action_layout)
+        self._mask_sources[row] = source
+        self.has_masks = source.kind != "none"
+        if source.kind != self._mask_sources[0].kind:
+            raise ApiBreak(
+                f"this copy's action masks come from {source.kind!r}, copy 0's from "
+                f"{self._mask_sources[0].kind!r}"
+            )
+
+    def _store_mask(self, row: int, observation: Any, info: dict[str, Any]) -> None:
+        mask = self._mask_sources[row].read(observation, info)
+        self.buffers.masks[row] = self.action_layout.flatten_mask(mask, 1)
+
+    def _check_masks(self) -> None:
+        while self.has_masks and len(blocked := self.action_layout.blocked_rows(self.buffers.masks)):
+            self._restart(int(blocked[0]), ApiBreak(NOTHING_ALLOWED))
+
+    # ------------------------------------------------------------------------------------------------ faults
+
+    def _restart(self, row: int, error: BaseException) -> None:
+        """Restart an environment after a fault, as often as the policy allows; else raise the fault.
+
+        The step in which it failed did not take place (``buffers.cut``), unless only the reset after it
+        failed.
+        """
+        fault = self._fault(row, error)
+        if not (self.policy.restart and self.makers):
+            raise fault from error
+        buffers = self.buffers
+        complete = bool(buffers.terminated[row] or buffers.truncated[row])
+
+        def attempt() -> None:
+            buffers.restarts[row] += 1
+            wait_before_restart(int(buffers.restarts[row]), self.policy)
+            self._replace(row)
+            self._begin(row)
+
+        self.restarts.until_it_works(fault, attempt, lambda again: self._fault(row, again))
+        if not complete and self._count:
+            buffers.cut[row] = True
+            buffers.rewards[row] = 0.0
+        self._dirty = True
+
+    def _replace(self, row: int) -> None:
+        """Make another environment for a row; an instance that the user gave stays and is reset."""
+        old = self.envs[row]
+        fresh: list[gym.Env] = []
+        make_all(self.makers[row : row + 1], fresh)
+        check_alike(fresh, self.observation_layout, self.action_layout, self.name)
+        if fresh[0] is not old:
+            with contextlib.suppress(Exception):
+                old.close()
+        self.envs[row] = fresh[0]
+
+    def _seed_of(self, row: int) -> int:
+        return seed_of(self._seed, int(self.buffers.restarts[row]), self.first + row)
+
+    def _fault(self, row: int, error: BaseException) -> EnvironmentFault:
+        action = None
+        if self._count:
+            action = action_text(self.action_layout.to_env_single(self.buffers.actions[row]))
+        index = self.first + row
+        return explained(
+            error,
+            f"environment {index} ({self.name})",
+            index,
+            self._count,
+            env_id=self.name,
+            worker=self.worker,
+            seed=self._seed_of(row),
+            action=action,
+        )
+
+    # ------------------------------------------------------------------------------------------------- state
+
+    def get_state(self) -> list[Any]:
+        """The packed state of every environment (see state.py)."""
+        return [self._state_call(row, states.state_of, env) for row, env in enumerate(self.envs)]
+
+    def set_state(self, found: list[Any]) -> None:
+        """Put packed states back into environments that have been reset."""
+        for row, (env, state) in enumerate(zip(self.envs, found, strict=True)):
+            self._state_call(row, states.put_back, env, state)
+
+    def _state_call(self, row: int, function: Callable[..., Any], *arguments: Any) -> Any:
+        self._calls += 1
+        self.buffers.current[0] = row
+        try:
+            return function(*arguments)
+        except RAISED as error:
+            index = self.first + row
+            raise EnvironmentFault(
+                f"the state of environment {index} ({self.name}) cannot be kept: {type(error).__name__}: "
+                f"{error}.",
+                index,
+                self._count,
+                env_id=self.name,
+                worker=self.worker,
+            ) from error
+        finally:
+            self.buffers.current[0] = -1

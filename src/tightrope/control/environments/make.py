@@ -1,0 +1,172 @@
+"""The environments of a run, made from whatever the user names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+
+from tightrope.control.environments import tasks
+from tightrope.control.environments.base import Environments
+from tightrope.control.environments.faults import FaultPolicy
+from tightrope.control.environments.pool import EnvironmentPool
+from tightrope.control.environments.processes import available_cores
+from tightrope.control.environments.vector import VectorEnvironments, is_vector_env
+
+BACKENDS = ("auto", "serial", "workers", "vector", "envpool")
+# A step of these takes tens of microseconds, so that waking a worker pays.
+SLOW_MODULES = ("gymnasium.envs.mujoco", "gymnasium.envs.box2d")
+# Numpy: 43 us a step for any small number of environments, against about 7.5 us each one by one.
+NUMPY_VECTOR_IDS = ("CartPole-v0", "CartPole-v1")
+NUMPY_VECTOR_FROM = 6
+
+
+class Backend(NamedTuple):
+    """What steps the environments, and in how many processes (this one included)."""
+
+    name: str  # "serial" | "workers" | "vector" | "envpool" | "given"
+    num_workers: int = 1
+
+
+def choose_backend(
+    env_id: str | None, num_envs: int, num_workers: int | None = None, cores: int = 1
+) -> Backend:
+    """The backend that ``auto`` means: a function of these arguments, never of a timing.
+
+    ``env_id`` None: a factory, or an instance without a spec. Asking for more than one worker means workers.
+    Jax versions of a task are never chosen: they would be compiled first.
+    """
+    if num_workers is not None and num_workers > 1 and num_envs > 1:
+        return Backend("workers", min(num_workers, num_envs))
+    if env_id is None:
+        return Backend("serial")
+    if env_id.startswith("ALE/") or (env_id in NUMPY_VECTOR_IDS and num_envs >= NUMPY_VECTOR_FROM):
+        return Backend("vector")
+    groups = min(cores, num_envs) if num_workers is None else 1
+    if groups > 1 and tasks.entry_module(tasks.find_spec(env_id)).startswith(SLOW_MODULES):
+        return Backend("workers", groups)
+    return Backend("serial")
+
+
+def make_environments(
+    env: str | gym.Env | Callable[[], gym.Env] | gym.vector.VectorEnv,
+    num_envs: int | None = None,
+    *,
+    backend: str = "auto",
+    num_workers: int | None = None,
+    squash: bool = False,
+    policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
+) -> Environments:
+    """``num_envs`` environments from a Gymnasium id, an instance, a factory, or a vector environment.
+
+    ``num_envs`` None: 1, or what the vector environment has. A given instance or vector environment is
+    stepped but never closed. ``policy``: what a fault leads to. ValueError: an unknown id, a backend the task
+    does not have, an instance that cannot be replicated, spaces that are not supported.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"vector backend is {backend!r}; expected one of: {', '.join(BACKENDS)}.")
+    if is_vector_env(env):
+        chosen = Backend("given")
+        environments: Environments
+        environments = _given(env, num_envs, backend, policy)
+    else:
+        num_envs = 1 if num_envs is None else num_envs
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}; expected at least 1.")
+        if not isinstance(env, str | gym.Env) and not callable(env):
+            raise ValueError(
+                f"env is a {type(env).__name__}; expected a Gymnasium id, an environment, a zero-argument "
+                "factory or a vector environment."
+            )
+        chosen = _resolve(env, num_envs, backend, num_workers)
+        if isinstance(env, str) and chosen.name in ("vector", "envpool"):
+            environments = _vector_version(env, num_envs, chosen.name, policy)
+        else:
+            environments = _pool(env, num_envs, chosen.num_workers, policy)
+    environments.backend, environments.num_workers = chosen
+    if squash:
+        try:
+            environments.action_layout.check_squash()
+        except ValueError:
+            environments.close()
+            raise
+        environments.squash = True
+    return environments
+
+
+def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> Backend:
+    """The backend to use: the one asked for where it is possible, else ``choose_backend``'s."""
+    cores = available_cores()
+    if backend in ("vector", "envpool"):
+        if not isinstance(env, str):
+            raise ValueError(
+                f"vector backend {backend!r} needs a Gymnasium id; {_name(env)} is an object. Use auto."
+            )
+        return Backend(backend)
+    if backend == "serial":
+        return Backend("serial")
+    if backend == "workers":
+        return Backend("workers", min(num_envs, num_workers or cores))
+    if isinstance(env, str):
+        return choose_backend(env, num_envs, num_workers, cores)
+    env_id = env.spec.id if isinstance(env, gym.Env) and env.spec else None
+    chosen = choose_backend(env_id, num_envs, num_workers, cores)
+    # an instance may have been made with other arguments than its vector version would be
+    return Backend("serial") if chosen.name == "vector" else chosen
+
+
+def _pool(env: Any, num_envs: int, num_groups: int, policy: FaultPolicy) -> EnvironmentPool:
+    makers: list[Callable[[], gym.Env]]
+    if isinstance(env, str):
+        name = env
+        makers = [lambda: tasks.make_by_id(env)] * num_envs
+    elif isinstance(env, gym.Env):
+        name = _name(env)
+        makers = tasks.replicas(env, num_envs)
+    else:
+        name = getattr(env, "__name__", type(env).__name__)
+        makers = [env] * num_envs
+    pool = EnvironmentPool(makers, num_groups, name, keep_first=isinstance(env, gym.Env), policy=policy)
+    if isinstance(env, str):
+        pool.spec_id = env
+    return pool
+
+
+def _vector_version(env_id: str, num_envs: int, backend: str, policy: FaultPolicy) -> VectorEnvironments:
+    """The task's own vector version, or EnvPool's."""
+    if backend == "vector":
+        make = lambda seed: tasks.make_vector_by_id(env_id, num_envs)  # noqa: E731
+        vector = make(0)
+        environments = VectorEnvironments(lambda seed: vector, env_id, policy, make)
+    else:
+        threads = min(num_envs, available_cores())
+        make = lambda seed: tasks.make_envpool(env_id, num_envs, seed, threads)  # noqa: E731
+        environments = VectorEnvironments(make, env_id, policy, make, int32_actions=True)
+    environments.max_episode_steps = _time_limit(tasks.find_spec(env_id))
+    return environments
+
+
+def _given(env: Any, num_envs: int | None, backend: str, policy: FaultPolicy) -> VectorEnvironments:
+    """A vector environment that the user gave as an object."""
+    if num_envs not in (None, int(env.num_envs)):
+        raise ValueError(
+            f"num_envs is {num_envs}, but the vector environment given has {env.num_envs} copies."
+        )
+    if backend != "auto":
+        raise ValueError(
+            f"vector backend {backend!r} asked for, but a vector environment was given. Use auto."
+        )
+    envpool = not isinstance(env, gym.vector.VectorEnv)
+    environments = VectorEnvironments(lambda seed: env, _name(env), policy, keep=True, int32_actions=envpool)
+    environments.max_episode_steps = _time_limit(getattr(env, "spec", None))
+    return environments
+
+
+def _time_limit(spec: Any) -> int | None:
+    return getattr(spec, "max_episode_steps", None)
+
+
+def _name(env: Any) -> str:
+    spec = getattr(env, "spec", None)
+    return getattr(spec, "id", None) or type(getattr(env, "unwrapped", env)).__name__

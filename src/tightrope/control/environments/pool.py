@@ -1,0 +1,409 @@
+"""Single environments spread over this process and worker processes.
+
+With k groups this process steps the first one and k - 1 workers step the others, so that no core waits. Where
+a fault is to be survived this process steps none and k workers step them all: a worker that dies takes
+nothing else along.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import signal
+import socket
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, final
+
+import gymnasium as gym
+import numpy as np
+
+from tightrope.control.environments import state as states
+from tightrope.control.environments.base import Environments, Step, StepBuffers
+from tightrope.control.environments.faults import (
+    RAISED,
+    EnvironmentFault,
+    FaultPolicy,
+    action_text,
+    seed_of,
+    wait_before_restart,
+)
+from tightrope.control.environments.group import EnvGroup
+from tightrope.control.environments.processes import (
+    BROKEN,
+    CLOSE,
+    COMMAND,
+    GET_STATE,
+    MASKED,
+    READY,
+    RESET,
+    SET_STATE,
+    SPIN,
+    STEP,
+    SharedArray,
+    Worker,
+    available_cores,
+    close_inherited,
+    pack_json,
+    receive_all,
+    receive_soon,
+    start_context,
+)
+from tightrope.control.environments.tasks import check_alike, make_all
+from tightrope.control.environments.watchdog import Watchdog
+from tightrope.control.spaces import Inputs, action_layout, observation_layout
+
+
+@final
+class EnvironmentPool(Environments):
+    """B single environments in ``num_groups`` processes, this one included; the number changes no bit.
+
+    ``makers``: one zero-argument function per environment; environment i is seeded with seed + i.
+    ``keep_first``: the caller closes environment 0. After a fault an environment that raised is restarted
+    where it was; when a process died or hung, all of that process are.
+    """
+
+    def __init__(
+        self,
+        makers: Sequence[Callable[[], gym.Env]],
+        num_groups: int,
+        name: str,
+        *,
+        keep_first: bool = False,
+        policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
+    ) -> None:
+        super().__init__(policy)
+        self.name = name
+        self.num_envs = len(makers)
+        self._makers = makers
+        self._keep = 1 if keep_first else 0
+        self._seed = 0
+        self._count = 0  # steps since the last reset of all
+        self._restarts_seen = 0  # of those in the buffers, how many the counter holds
+        self._bounds = [round(k * len(makers) / num_groups) for k in range(num_groups + 1)]
+        if policy.restart and num_groups > 1:  # no environment in this process: its death would end the run
+            self._bounds.insert(0, 0)
+        here = self._bounds[1]
+        workers_first = (slice(here, self.num_envs), slice(0, here))  # they step while this process chooses
+        self.row_groups = workers_first if 0 < here < self.num_envs else (slice(0, self.num_envs),)
+        self._group: EnvGroup | None = None  # stepped in this process
+        self._workers: list[Worker] = []
+        self._watchdog: Watchdog | None = None
+        envs: list[gym.Env] = []
+        try:
+            make_all(makers[: here or 1], envs)
+            self._describe(envs)
+            self._allocate(shared=num_groups > 1)
+            if here:
+                buffers = self._buffers.map(lambda array: array[:here])
+                self._group = EnvGroup(envs, buffers, name, makers=makers[:here], policy=policy)
+            else:  # it was made for its spaces only
+                self._close_all(envs)
+                envs = []
+            for number in range(1, len(self._bounds) - 1):
+                self._workers.append(self._start(number))
+            for worker in self._workers:
+                worker.wait()
+        except BaseException:
+            self._stop_workers()
+            self._close_all(envs)
+            raise
+        if policy.timeout is not None and self._group is not None:
+            self._watchdog = Watchdog(self._group.call_number, policy.timeout, f"An environment ({name})")
+
+    def _describe(self, envs: list[gym.Env]) -> None:
+        spec = envs[0].spec
+        self.spec_id = spec.id if spec is not None else type(envs[0].unwrapped).__name__
+        self.max_episode_steps = getattr(spec, "max_episode_steps", None)
+        self.observation_layout = observation_layout(envs[0].observation_space)
+        self.action_layout = action_layout(envs[0].action_space)
+        self.gives_state = states.gives_state(envs[0])
+        check_alike(envs, self.observation_layout, self.action_layout, self.name)
+
+    def _allocate(self, *, shared: bool) -> None:
+        layouts = (self.observation_layout, self.action_layout)
+        self._context = start_context()
+        self._shared: StepBuffers | None = None
+        if shared:
+            zeros = lambda shape, dtype: SharedArray(self._context, shape, dtype)  # noqa: E731
+            self._shared = StepBuffers.allocate(self.num_envs, *layouts, zeros)
+            self._buffers = self._shared.map(SharedArray.view)
+        else:
+            self._buffers = StepBuffers.allocate(self.num_envs, *layouts)
+
+    def _start(self, number: int) -> Worker:
+        """Start the process of group ``number``."""
+        first, last = self._bounds[number : number + 2]
+        spin = SPIN if len(self._bounds) - 1 <= available_cores() else 0.0
+        makers = self._makers[first:last]
+        return Worker(
+            self._context, _serve, makers, self._shared, first, number, self.name, spin, self.policy
+        )
+
+    def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
+        """See Environments."""
+        if self._watchdog is not None:
+            self._watchdog.start()
+        self._seed = seed
+        self._count = 0
+        self._restarts_seen = 0
+        self._buffers.restarts.fill(0)
+        for worker in self._workers:
+            worker.send(RESET, seed)
+        if self._group is not None:
+            self._group.reset(seed)
+        self._has_masks = self._await_workers() or (self._group is not None and self._group.has_masks)
+        step = self._buffers.step(self._has_masks)
+        return step.inputs, step.action_mask
+
+    def _send(self, rows: slice, actions: np.ndarray) -> None:
+        self._buffers.actions[rows] = actions
+        if rows.stop > self._bounds[1]:
+            for worker in self._workers:
+                worker.send(STEP)
+
+    def receive(self) -> Step:
+        """See Environments."""
+        self._count += 1
+        if self._group is not None:
+            self._group.step()
+        self._await_workers()
+        return self._buffers.step(self._has_masks)
+
+    # ------------------------------------------------------------------------------------------------- state
+
+    def get_state(self) -> dict[str, Any]:
+        """See Environments."""
+        with self._no_restart():
+            for worker in self._workers:
+                worker.send(GET_STATE)
+            found = [] if self._group is None else self._group.get_state()
+            for worker in self._workers:
+                worker.wait()
+                found += worker.states()
+        return {"seed": self._seed, "renewals": self._buffers.restarts.tolist(), "states": found}
+
+    def _set_state(self, state: dict[str, Any]) -> None:
+        self._buffers.restarts[:] = state["renewals"]
+        self._restarts_seen = sum(state["renewals"])
+        found = state["states"]
+        with self._no_restart():
+            if self._group is not None:
+                self._group.set_state(found[: self._bounds[1]])
+            for worker, (first, last) in zip(
+                self._workers, itertools.pairwise(self._bounds[1:]), strict=True
+            ):
+                data = json.dumps(found[first:last], allow_nan=False).encode()
+                worker.send(SET_STATE, len(data), data)
+                worker.wait()
+
+    @contextlib.contextmanager
+    def _no_restart(self) -> Iterator[None]:
+        """A fault inside ends the run: an environment that was restarted would be in another state."""
+        try:
+            yield
+        except EnvironmentFault as fault:
+            if not fault.lost:
+                raise
+            raise self._described(self._workers[fault.worker - 1], fault, "keeping the state of") from fault
+
+    # ------------------------------------------------------------------------------------------------ faults
+
+    def count_from(self, restarts: int) -> None:
+        """See Environments."""
+        super().count_from(restarts)
+        if self._group is not None:
+            self._group.restarts.count = restarts
+
+    def _await_workers(self) -> bool:
+        """Wait for every worker's reply; whether one of them has action masks."""
+        masked = [self._reply(place) for place in range(len(self._workers))]
+        if self.policy.restart:
+            self._count_restarts()
+        return any(masked)
+
+    def _count_restarts(self) -> None:
+        """Count the restarts that the groups made on their own."""
+        restarts = int(self._buffers.restarts.sum())
+        self._restarts.count += restarts - self._restarts_seen
+        self._restarts_seen = restarts
+        if self._restarts.count > self.policy.max_restarts:
+            raise self._restarts.given_up(EnvironmentFault(f"Environments of {self.name} keep failing."))
+
+    def _reply(self, place: int) -> bool:
+        try:
+            return self._workers[place].wait()
+        except EnvironmentFault as fault:
+            fault = self._described(self._workers[place], fault) if fault.lost else fault
+            if not (self.policy.restart and fault.lost):
+                raise fault from fault.__cause__
+            return self._restart(place, fault)
+
+    def _restart(self, place: int, fault: EnvironmentFault) -> bool:
+        """Replace a process that is gone by another one, and reset its environments; as `Worker.wait`."""
+        buffers = self._buffers
+        rows = slice(*self._bounds[place + 1 : place + 3])
+
+        def attempt() -> bool:
+            self._workers[place].stop()
+            buffers.restarts[rows] += 1
+            self._restarts_seen += rows.stop - rows.start  # one restart, however many environments
+            wait_before_restart(int(buffers.restarts[rows.start]), self.policy)
+            fresh = self._workers[place] = self._start(place + 1)
+            fresh.wait()
+            fresh.send(RESET, self._seed)
+            return fresh.wait()
+
+        def explain(error: BaseException) -> EnvironmentFault:
+            if not (isinstance(error, EnvironmentFault) and error.lost):
+                raise error
+            return self._described(self._workers[place], error)
+
+        masked = self._restarts.until_it_works(fault, attempt, explain)
+        if self._count:
+            buffers.cut[rows] = True
+            buffers.rewards[rows] = 0.0
+        buffers.terminated[rows] = False
+        buffers.truncated[rows] = False
+        return masked
+
+    def _described(
+        self, worker: Worker, fault: EnvironmentFault, doing: str = "stepping"
+    ) -> EnvironmentFault:
+        """The fault of a process that is gone, with what is known of the environment it was stepping."""
+        row = int(self._buffers.current[worker.first])
+        if row < 0:
+            return fault
+        index = worker.first + row
+        seed, action, what = self.seed_of(index), None, "the reset"
+        if self._count:
+            action = action_text(self.action_layout.to_env_single(self._buffers.actions[index]))
+            what = f"step {self._count}, last action {action}"
+        return EnvironmentFault(
+            f"{fault} It was {doing} environment {index}: {what}, seed {seed}.",
+            index,
+            self._count,
+            env_id=self.name,
+            worker=worker.number,
+            seed=seed,
+            action=action,
+            lost=True,
+        )
+
+    def seed_of(self, row: int) -> int:
+        """See Environments."""
+        return seed_of(self._seed, int(self._buffers.restarts[row]), row)
+
+    def worker_of(self, row: int) -> int:
+        """See Environments."""
+        return next(k for k, last in enumerate(self._bounds[1:]) if row < last)
+
+    # ----------------------------------------------------------------------------------------------- the end
+
+    def close(self) -> None:
+        """See Environments."""
+        if self._watchdog is not None:
+            self._watchdog.stop()
+        self._stop_workers()
+        if self._group is not None:
+            self._close_all(self._group.envs)
+            self._group.envs = []
+
+    def _close_all(self, envs: Sequence[gym.Env]) -> None:
+        for env in envs[self._keep :]:
+            env.close()
+
+    def _stop_workers(self) -> None:
+        for worker in self._workers:
+            worker.send(CLOSE)
+        deadline = time.monotonic() + 2.0  # for all of them: a run that is asked to stop has ten seconds
+        for worker in self._workers:
+            worker.stop(max(0.0, deadline - time.monotonic()))
+        self._workers = []
+
+
+# --------------------------------------------------------------------------------------- in a worker process
+
+
+def _serve(
+    channel: socket.socket,
+    makers: Any,
+    shared: StepBuffers,
+    first: int,
+    number: int,
+    name: str,
+    spin: float,
+    policy: FaultPolicy,
+) -> None:
+    """The life of a worker: make its environments, then obey commands until told to stop."""
+    # Ctrl-C reaches the whole process group; the main process ends its workers in order
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not the main process's handler, which a fork inherits
+    close_inherited()
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    envs: list[gym.Env] = []
+    try:
+        make_all(makers.fn, envs)
+        buffers = shared.map(SharedArray.view).map(lambda array: array[first : first + len(envs)])
+        group = EnvGroup(envs, buffers, name, first, makers=makers.fn, policy=policy, worker=number)
+        envs = group.envs
+        _check_buffers(group, buffers)
+        channel.sendall(READY)
+        while (data := _obey(channel, group, spin)) is not None:
+            channel.sendall((MASKED if group.has_masks else READY) + data)
+    except (ConnectionError, EOFError):
+        pass  # the main process is gone
+    except RAISED as error:
+        if isinstance(error, EnvironmentFault):
+            fault = error
+        else:
+            text = f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
+            message = f"making copies of {name} in a worker failed: {text}"
+            fault = EnvironmentFault(message, first, env_id=name, worker=number)
+        with contextlib.suppress(OSError):
+            channel.sendall(BROKEN + pack_json(fault.record()))
+    finally:
+        for env in envs:
+            with contextlib.suppress(Exception):
+                env.close()
+        channel.close()
+
+
+def _end_with(parent: int) -> None:
+    """End this process soon after its parent, even while an environment hangs."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+def _obey(channel: socket.socket, group: EnvGroup, spin: float) -> bytes | None:
+    """Wait for a command and execute it; what to send behind the reply, None when it is time to stop."""
+    message = receive_soon(channel, COMMAND.size, spin)
+    if len(message) < COMMAND.size:
+        return None  # the main process is gone
+    command, number = COMMAND.unpack(message)
+    if command == RESET:
+        group.reset(number)
+    elif command == STEP:
+        group.step()
+    elif command == SET_STATE:
+        group.set_state(json.loads(receive_all(channel, number)))
+    elif command == GET_STATE:
+        return pack_json(group.get_state())
+    return None if command == CLOSE else b""
+
+
+def _check_buffers(group: EnvGroup, buffers: StepBuffers) -> None:
+    """ValueError when a worker's environments do not fit the arrays that the first environment laid out."""
+    expected = {name: array.shape[1:] for name, array in buffers.inputs.items()}
+    found = {name: array.shape[1:] for name, array in group.observation_layout.allocate(0).items()}
+    layout = group.action_layout
+    widths = (buffers.actions.shape[1], buffers.masks.shape[1])
+    if found != expected or (layout.num_columns, layout.num_logits) != widths:
+        raise ValueError(
+            f"the copies differ: {group.envs[0].observation_space}, {layout.space}; expected {expected}."
+        )

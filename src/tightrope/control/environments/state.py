@@ -1,0 +1,130 @@
+"""The state of environments that can give it, as JSON; nothing is pickled.
+
+An environment takes part by two methods: ``get_state()`` returns what it is in the middle of, made of None,
+numbers, strings, bytes, lists, dicts with string keys and numpy arrays; ``set_state(state)`` continues from
+there. Its generator ``np_random`` and Gymnasium's time limit are kept for it. A wrapper in between that has
+a state of its own needs the two methods itself, and then speaks for everything inside it.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+
+KINDS = "biufc"  # of arrays: bool, int, unsigned, float, complex
+ARRAY, BYTES, NUMBER = "array", "bytes", "number"
+# the methods by which an environment gives and takes its state
+GET, SET = "get_state", "set_state"
+
+
+def pack(value: Any, place: str = "state") -> Any:
+    """``value`` in terms of JSON, exactly. TypeError for what no file can hold without pickling it."""
+    if (
+        value is None
+        or isinstance(value, bool | int | str)
+        or (type(value) is float and math.isfinite(value))
+    ):
+        return value
+    if isinstance(value, float) and not isinstance(value, np.floating):
+        return {NUMBER: repr(value)}  # JSON has no NaN and no infinities
+    if isinstance(value, bytes):
+        return {BYTES: base64.b64encode(value).decode()}
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in KINDS:
+        whole = np.ascontiguousarray(value)
+        text = base64.b64encode(whole.tobytes()).decode()
+        return {ARRAY: [whole.dtype.str, list(np.shape(value)), text]}
+    if isinstance(value, list | tuple):
+        return [pack(item, f"{place}[{index}]") for index, item in enumerate(value)]
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return {"dict": {key: pack(item, f"{place}[{key!r}]") for key, item in value.items()}}
+    raise TypeError(
+        f"{place} is a {type(value).__name__}, which no file can hold without pickling it; give None, "
+        "numbers, strings, bytes, lists, dicts with string keys and numpy arrays of numbers"
+    )
+
+
+def unpack(value: Any) -> Any:
+    """What `pack` was given; tuples come back as lists. ValueError for anything that it did not make."""
+    if isinstance(value, list):
+        return [unpack(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    match value:
+        case {"dict": dict(inner)}:
+            return {key: unpack(item) for key, item in inner.items()}
+        case {"number": str(text)}:
+            return float(text)
+        case {"bytes": str(text)}:
+            return base64.b64decode(text)
+        case {"array": [str(kind), list(shape), str(text)]} if np.dtype(kind).kind in KINDS:
+            found = np.frombuffer(base64.b64decode(text), np.dtype(kind)).reshape(shape).copy()
+            return found if shape else found[()]
+    raise ValueError(f"a saved state holds {str(value)[:80]}, which this version does not read.")
+
+
+def alike(found: Any, like: Any) -> bool:
+    """Whether two arrays, or dicts of them, agree in names, dtypes and shapes; None agrees with None."""
+    if isinstance(found, dict) and isinstance(like, dict):
+        return found.keys() == like.keys() and all(alike(found[name], like[name]) for name in like)
+    if isinstance(found, np.ndarray) and isinstance(like, np.ndarray):
+        return found.shape == like.shape and found.dtype == like.dtype
+    return found is None and like is None
+
+
+def _layers(env: gym.Env) -> tuple[list[TimeLimit], Any] | None:
+    """The time limits around the layer that gives a state, and that layer; None where there is none, or where
+    a wrapper outside it has a state that nobody knows.
+    """
+    limits: list[TimeLimit] = []
+    layer: Any = env
+    while not (callable(getattr(layer, GET, None)) and callable(getattr(layer, SET, None))):
+        if isinstance(layer, TimeLimit):
+            limits.append(layer)
+        elif not isinstance(layer, OrderEnforcing | PassiveEnvChecker):
+            return None
+        layer = layer.env
+    return limits, layer
+
+
+def _given(env: gym.Env) -> tuple[list[TimeLimit], Any]:
+    found = _layers(env)
+    assert found is not None, "asked for a state that it cannot give"
+    return found
+
+
+def gives_state(env: Any) -> bool:
+    """Whether a single or a vector environment can give its state."""
+    if isinstance(env, gym.Env):
+        return _layers(env) is not None
+    return callable(getattr(env, GET, None)) and callable(getattr(env, SET, None))
+
+
+def state_of(env: Any) -> Any:
+    """The packed state of an environment that gives one. TypeError as `pack`."""
+    if not isinstance(env, gym.Env):
+        return pack({"own": env.get_state()})
+    limits, layer = _given(env)
+    found = {"own": layer.get_state(), "elapsed": [limit._elapsed_steps for limit in limits]}
+    rng = getattr(env.unwrapped, "_np_random", None)
+    if isinstance(rng, np.random.Generator):
+        found["rng"] = rng.bit_generator.state
+    return pack(found)
+
+
+def put_back(env: Any, packed: Any) -> None:
+    """Give an environment, which has been reset, the state that `state_of` found."""
+    state = unpack(packed)
+    if not isinstance(env, gym.Env):
+        env.set_state(state["own"])
+        return
+    limits, layer = _given(env)
+    layer.set_state(state["own"])
+    for limit, elapsed in zip(limits, state["elapsed"], strict=True):
+        limit._elapsed_steps = elapsed
+    if "rng" in state:
+        env.unwrapped.np_random.bit_generator.state = state["rng"]

@@ -1,0 +1,382 @@
+"""Gymnasium's vector environments, in all three of their reset modes, as `Environments`.
+
+SAME_STEP: the row holds the next episode's first observation, the true last one is in info["final_obs"].
+NEXT_STEP: the row holds the true last observation; the next step ignores its action and only resets (a
+phantom row). DISABLED: this module resets the rows that ended, with options={"reset_mask": ...}.
+
+A vector environment fails as a whole: all its rows are lost, and all are restarted. The vector versions of an
+id and EnvPool's can be; one that the user gave as an object cannot, and its fault ends the run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Callable
+from typing import Any, final
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from tightrope.control.environments import state as states
+from tightrope.control.environments.base import Environments, Step
+from tightrope.control.environments.faults import (
+    RAISED,
+    ApiBreak,
+    EnvironmentFault,
+    FaultPolicy,
+    action_text,
+    check_finite,
+    describe,
+    explained,
+    restart_seed,
+    wait_before_restart,
+)
+from tightrope.control.environments.masks import find_source, vector_masks
+from tightrope.control.environments.watchdog import Watchdog
+from tightrope.control.spaces import Inputs, action_layout, observation_layout
+
+# the second is a slip in some of Gymnasium's own environments
+MODE_KEYS = ("autoreset_mode", "autoreseet-mode")
+
+
+def is_vector_env(env: Any) -> bool:
+    """True for Gymnasium's vector environments, and for EnvPool's, which only look like them."""
+    if isinstance(env, VectorEnv):
+        return True
+    looks_like = hasattr(env, "single_action_space") and hasattr(env, "num_envs")
+    return looks_like and not isinstance(env, gym.Env | type)
+
+
+def autoreset_mode(env: Any) -> AutoresetMode:
+    """The mode that a vector environment declares; NEXT_STEP with a warning when it declares none."""
+    tag = next((env.metadata[key] for key in MODE_KEYS if key in env.metadata), None)
+    if isinstance(tag, AutoresetMode):
+        return tag
+    modes = {mode.value.lower(): mode for mode in AutoresetMode}
+    word = str(tag).rsplit(".", 1)[-1].replace("_", "").lower()
+    if word in modes:
+        return modes[word]
+    if tag is not None:
+        raise ValueError(
+            f"autoreset_mode of {env} is {tag!r}; expected one of {[m.name for m in AutoresetMode]}."
+        )
+    warnings.warn(
+        f"{type(env).__name__} does not say in metadata['autoreset_mode'] how it resets; taken as NEXT_STEP. "
+        "Add the entry if it resets otherwise: a wrong mode spoils the advantages.",
+        stacklevel=2,
+    )
+    return AutoresetMode.NEXT_STEP
+
+
+@final
+class VectorEnvironments(Environments):
+    """B environments inside one gymnasium.vector.VectorEnv.
+
+    ``make(seed)`` gives the environment to use from a reset with this seed on: usually always the same one
+    (EnvPool fixes its seeds when it is built). ``make_another(seed)`` builds another one after a fault; None:
+    impossible. ``keep`` leaves closing to the caller.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int], Any],
+        name: str,
+        policy: FaultPolicy,
+        make_another: Callable[[int], Any] | None = None,
+        *,
+        keep: bool = False,
+        int32_actions: bool = False,
+    ) -> None:
+        super().__init__(policy)
+        self.name = name
+        self.spec_id = name
+        self._make = make
+        self._make_another = make_another
+        self._keep = keep
+        self._int32 = int32_actions
+        self._use(make(0))
+        self.observation_layout = observation_layout(self._env.single_observation_space)
+        self.action_layout = action_layout(self._env.single_action_space)
+        self.gives_state = states.gives_state(self._env)
+        self.row_groups = (slice(0, self.num_envs),)  # they are stepped together
+        self._seed = 0
+        self._count = 0  # steps since the last reset by the caller
+        self._restarts_here = 0  # since then
+        self._calls = 0  # of the environment, that have begun
+        self._in_call = False
+        self._watchdog: Watchdog | None = None
+        if policy.timeout is not None:
+            self._watchdog = Watchdog(self.call_number, policy.timeout, f"The vector environment {name}")
+
+    def _use(self, env: Any) -> None:
+        self._env = env
+        self.num_envs = int(env.num_envs)
+        self.mode = autoreset_mode(env)
+
+    def call_number(self) -> int | None:
+        """A number that changes with every call; None between calls."""
+        return self._calls if self._in_call else None
+
+    def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
+        """See Environments."""
+        if self._watchdog is not None:
+            self._watchdog.start()
+        self._seed = seed
+        self._count = 0
+        self._restarts_here = 0
+        try:
+            return self._reset(seed)
+        except RAISED as error:
+            return self._restart(error)
+
+    def _reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
+        self._calls += 1
+        self._in_call = True
+        try:
+            env = self._make(seed)
+            if env is not self._env:
+                self._close_env()
+                self._use(env)
+            self._ended = np.zeros(self.num_envs, bool)
+            self._any_ended = False
+            with warnings.catch_warnings():
+                # it was built with the seed
+                warnings.filterwarnings("ignore", message="EnvPool seeds are fixed")
+                result = env.reset(seed=seed)
+            if not (isinstance(result, tuple) and len(result) == 2):
+                raise ApiBreak(f"reset returned {describe(result)}, expected the pair (observations, infos)")
+            observations, infos = result
+            self._mask_source = find_source(env, infos, self.observation_layout, self.action_layout)
+            inputs = self._encode(observations)
+            masks = self._masks(observations, infos, None)
+            self._check_finite(inputs, "observation")
+        finally:
+            self._in_call = False
+        return inputs, masks
+
+    def _send(self, rows: slice, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def receive(self) -> Step:
+        """Step all rows with the actions sent; after a fault all episodes are cut."""
+        self._calls += 1
+        self._in_call = True
+        self._count += 1
+        try:
+            step = self._step()
+            if self.policy.restart:
+                check_finite("reward", step.rewards)
+                self._check_finite(step.inputs, "observation")
+                self._check_finite(step.final_inputs or {}, "final observation")
+            return step
+        except RAISED as error:
+            self._in_call = False
+            inputs, masks = self._restart(error)
+            rewards = np.zeros(self.num_envs)
+            no_end = np.zeros(self.num_envs, bool)
+            return Step(inputs, masks, rewards, no_end, no_end.copy(), cut=~no_end)
+        finally:
+            self._in_call = False
+
+    def _check_finite(self, inputs: Inputs, what: str) -> None:
+        if self.policy.restart and "flat" in inputs:
+            check_finite(what, inputs["flat"])
+
+    def _step(self) -> Step:
+        actions = self.action_layout.to_env(self._actions)
+        result = self._env.step(_to_int32(actions) if self._int32 else actions)
+        if not isinstance(result, tuple) or len(result) != 5:
+            raise ApiBreak(
+                f"step returned {describe(result)}, expected five values: observations, rewards, "
+                "terminations, truncations, infos"
+            )
+        observations, rewards, terminated, truncated, infos = result
+        rewards, terminated, truncated = self._check(rewards, terminated, truncated)
+        inputs = self._encode(observations)
+        if self.mode == AutoresetMode.NEXT_STEP:
+            phantom = self._ended if self._any_ended else None
+            if phantom is not None:
+                rewards = np.where(phantom, 0.0, rewards)
+                terminated = terminated > phantom
+                truncated = truncated > phantom
+            self._ended = terminated | truncated
+            self._any_ended = _any(self._ended)
+            masks = self._masks(observations, infos, self._ended)
+            return Step(inputs, masks, rewards, terminated, truncated, phantom)
+        if self.mode == AutoresetMode.SAME_STEP:
+            rows = np.flatnonzero(truncated) if _any(truncated) else None
+            finals = None if rows is None else self._final_inputs(infos, rows)
+            masks = self._masks(observations, infos, None)
+            return Step(inputs, masks, rewards, terminated, truncated, None, rows, finals)
+        masks = self._masks(observations, infos, terminated | truncated)
+        return self._reset_ended(Step(inputs, masks, rewards, terminated, truncated))
+
+    def _check(
+        self, rewards: Any, terminated: Any, truncated: Any
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rewards and flags as arrays [B]; where both flags are set, terminated wins."""
+        arrays = (rewards, terminated, truncated)
+        if all(type(x) is np.ndarray and x.shape == (self.num_envs,) for x in arrays) and (
+            rewards.dtype.kind == "f" and terminated.dtype == truncated.dtype == bool
+        ):
+            return rewards, terminated, truncated > terminated  # "greater" of flags is "and not", in one pass
+        try:
+            rewards = np.array(rewards, np.float64)
+            terminated, truncated = np.array(terminated, bool), np.array(truncated, bool)
+        except (TypeError, ValueError) as error:
+            raise ApiBreak(f"rewards or flags are not arrays of numbers: {error}") from error
+        if not rewards.shape == terminated.shape == truncated.shape == (self.num_envs,):
+            raise ApiBreak(
+                f"rewards, terminations and truncations have shapes {rewards.shape}, {terminated.shape} and "
+                f"{truncated.shape}; expected ({self.num_envs},) each"
+            )
+        truncated &= ~terminated
+        return rewards, terminated, truncated
+
+    def _encode(self, observations: Any) -> Inputs:
+        try:
+            inputs = self.observation_layout.encode(observations, batched=True)
+        except ValueError as error:
+            raise ApiBreak(str(error)) from error
+        if any(len(array) != self.num_envs for array in inputs.values()):
+            raise ApiBreak(f"the observations hold {describe(observations)}, expected {self.num_envs} rows")
+        if self.observation_layout.plain and inputs["flat"] is observations:
+            # a vector environment may write into its own array again
+            inputs = {"flat": inputs["flat"].copy()}
+        return inputs
+
+    def _reset_ended(self, step: Step) -> Step:
+        """In mode DISABLED: reset the rows that ended."""
+        ended = step.terminated | step.truncated
+        if not ended.any():
+            return step
+        if step.truncated.any():
+            rows = np.flatnonzero(step.truncated)
+            finals = {name: array[rows] for name, array in step.inputs.items()}
+            step = step._replace(final_rows=rows, final_inputs=finals)
+        observations, infos = self._env.reset(options={"reset_mask": ended.copy()})
+        inputs = self._encode(observations)
+        for name, array in inputs.items():
+            changed = ~ended & ~_same_rows(array, step.inputs[name])
+            if changed.any():
+                raise ApiBreak(
+                    f"reset with a reset_mask also changed environments {np.flatnonzero(changed).tolist()}, "
+                    "which had not ended. Use autoreset mode SAME_STEP or NEXT_STEP with this vector "
+                    "environment"
+                )
+        fresh = self._masks(observations, infos, ~ended)
+        if step.action_mask is not None and fresh is not None:
+            step.action_mask[ended] = fresh[ended]
+        return step._replace(inputs=inputs)
+
+    def _final_inputs(self, infos: dict[str, Any], rows: np.ndarray) -> Inputs:
+        """The true last observations of ``rows``: one per row in an object array, or a dense batch."""
+        finals = infos.get("final_obs", infos.get("final_observation"))
+        present = infos.get("_final_obs", infos.get("_final_observation", np.ones(self.num_envs, bool)))
+        if finals is None or not np.asarray(present)[rows].all():
+            raise ApiBreak(
+                f"environments {rows.tolist()} were truncated in SAME_STEP mode but infos['final_obs'] is "
+                "missing; without it a truncation cannot be bootstrapped"
+            )
+        try:
+            if isinstance(finals, np.ndarray) and finals.dtype == object:
+                parts = [self.observation_layout.encode(finals[row], batched=False) for row in rows]
+                return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            whole = self.observation_layout.encode(finals, batched=True)
+        except ValueError as error:
+            raise ApiBreak(f"infos['final_obs']: {error}") from error
+        return {name: array[rows] for name, array in whole.items()}
+
+    def _masks(self, observations: Any, infos: dict[str, Any], idle: np.ndarray | None) -> np.ndarray | None:
+        return vector_masks(self._mask_source, observations, infos, idle, self.action_layout, self.num_envs)
+
+    # ------------------------------------------------------------------------------------------------ faults
+
+    def _restart(self, error: BaseException) -> tuple[Inputs, np.ndarray | None]:
+        """Build another vector environment and reset it, as often as the policy allows; else raise."""
+        fault = self._fault(error)
+        make = self._make_another
+        if not self.policy.restart or make is None:
+            raise fault from error
+
+        def attempt() -> tuple[Inputs, np.ndarray | None]:
+            self._restarts_here += 1
+            wait_before_restart(self._restarts_here, self.policy)
+            with contextlib.suppress(Exception):
+                self._close_env()
+            seed = self.seed_of(0)
+            fresh = make(seed)
+            self._make = lambda seed: fresh
+            self._use(fresh)
+            return self._reset(seed)
+
+        return self._restarts.until_it_works(fault, attempt, self._fault)
+
+    def _fault(self, error: BaseException) -> EnvironmentFault:
+        index = error.index if isinstance(error, ApiBreak) else -1
+        row = f"environment {index} of " if index >= 0 else "the vector environment "
+        advice = ""
+        if self.policy.restart and self._make_another is None:
+            advice = ". It was given as an object, which cannot be restarted: give an id or a factory"
+        return explained(
+            error,
+            f"{row}{self.name}",
+            index,
+            self._count,
+            env_id=self.name,
+            worker=0,
+            seed=self.seed_of(0),
+            action=action_text(self._actions.tolist()) if self._count else None,
+            advice=advice,
+        )
+
+    def seed_of(self, row: int) -> int:
+        """The one seed of all rows."""
+        return restart_seed(self._seed, self._restarts_here, 0) if self._restarts_here else self._seed
+
+    # ------------------------------------------------------------------------------------------------- state
+
+    def get_state(self) -> dict[str, Any]:
+        """See Environments."""
+        found = [states.state_of(self._env), self._ended.tolist()]
+        return {"seed": self._seed, "renewals": self._restarts_here, "states": found}
+
+    def _set_state(self, state: dict[str, Any]) -> None:
+        self._restarts_here = int(state["renewals"])
+        env_state, ended = state["states"]
+        states.put_back(self._env, env_state)
+        self._ended = np.array(ended, bool).reshape(self._ended.shape)
+        self._any_ended = _any(self._ended)
+
+    def close(self) -> None:
+        """See Environments; the caller's own environment stays open."""
+        if self._watchdog is not None:
+            self._watchdog.stop()
+        self._close_env()
+
+    def _close_env(self) -> None:
+        if self._env is not None and not self._keep:
+            self._env.close()
+        self._env = None
+
+
+def _any(flags: np.ndarray) -> bool:
+    """flags.any() for a handful of flags, ten times as fast: this is asked at every step."""
+    return b"\x01" in flags.tobytes()
+
+
+def _same_rows(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """bool [N]: rows that are equal, NaN counting as equal to NaN."""
+    equal = (a == b) | ((a != a) & (b != b))
+    return equal.reshape(len(a), -1).all(axis=1)
+
+
+def _to_int32(actions: Any) -> Any:
+    """The same structure with its integer arrays as int32, the only width that EnvPool takes."""
+    if isinstance(actions, dict):
+        return {key: _to_int32(value) for key, value in actions.items()}
+    if isinstance(actions, tuple):
+        return tuple(_to_int32(value) for value in actions)
+    return actions.astype(np.int32) if actions.dtype.kind in "iub" else actions

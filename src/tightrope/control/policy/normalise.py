@@ -1,0 +1,145 @@
+"""Running statistics of observations and rewards: frozen during a rollout and its update, moved after it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from tightrope.maths.statistics import RunningMoments
+
+Array = np.ndarray
+CLIP = 10.0
+
+
+class ObservationNormaliser:
+    """(x - mean) / sqrt(variance + 1e-8), clipped to +-10, on the columns that are Box observations.
+
+    ``mean`` and ``inverse_std`` [D] float32 are what a rollout uses; they change only in ``update``.
+    """
+
+    def __init__(self, continuous: Array) -> None:
+        self.continuous = continuous
+        self.moments = RunningMoments.empty(len(continuous))
+        self._freeze()
+
+    def _freeze(self) -> None:
+        mean, std = self.moments.mean.numpy(), np.sqrt(self.moments.variance.numpy() + 1e-8)
+        seen = float(self.moments.count) > 1
+        self.mean = np.where(self.continuous & seen, mean, 0.0).astype(np.float32)
+        self.inverse_std = np.where(self.continuous & seen, 1.0 / std, 1.0).astype(np.float32)
+
+    def __call__(self, flat: Array) -> Array:
+        """Normalised copy of [..., D] float32."""
+        return np.clip((flat - self.mean) * self.inverse_std, -CLIP, CLIP)
+
+    def update(self, flat: Array) -> None:
+        """Take in the raw observations [N, D] of a rollout that has been learned from."""
+        self.moments = self.moments.update(torch.from_numpy(flat))
+        self._freeze()
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Tensors to save."""
+        return {"count": self.moments.count, "mean": self.moments.mean, "variance": self.moments.variance}
+
+    def load(self, state: dict[str, torch.Tensor]) -> None:
+        """Take over saved tensors."""
+        self.moments = RunningMoments(state["count"], state["mean"], state["variance"])
+        self._freeze()
+
+
+class RewardNormaliser:
+    """r / sqrt(Var(R) + 1e-8), clipped to +-10, where R_t = r_t + gamma R_{t-1} restarts after either kind of
+    end.
+
+    The mean is not subtracted: that would change which policy is best. ``deviation`` is the scale in force.
+    """
+
+    def __init__(self, num_envs: int, gamma: float) -> None:
+        self.gamma, self.running = gamma, np.zeros(num_envs)
+        self.moments = RunningMoments.empty(1)
+
+    @property
+    def deviation(self) -> float:
+        """What rewards are divided by, and values multiplied by to be in the task's units."""
+        return float(np.sqrt(float(self.moments.variance) + 1e-8)) if float(self.moments.count) > 1 else 1.0
+
+    def __call__(self, rewards: Array) -> Array:
+        """Scaled rewards, float32."""
+        return np.clip(rewards / self.deviation, -CLIP, CLIP).astype(np.float32)
+
+    def update(self, rewards: Array, ended: Array, mask: Array) -> None:
+        """Take in the raw rewards [B, T] of a rollout; masked steps do not exist."""
+        series = np.empty_like(rewards)
+        for t in range(rewards.shape[1]):
+            stepped = self.running * self.gamma + rewards[:, t]
+            series[:, t] = stepped
+            self.running = np.where(ended[:, t], 0.0, np.where(mask[:, t], stepped, self.running))
+        self.moments = self.moments.update(torch.from_numpy(series[mask][:, None]))
+
+    def restart(self, num_envs: int) -> None:
+        """New episodes begin: another environment, or a resumed run."""
+        self.running = np.zeros(num_envs)
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Tensors to save."""
+        running = torch.from_numpy(self.running.copy())
+        moments = self.moments
+        return {
+            "count": moments.count,
+            "mean": moments.mean,
+            "variance": moments.variance,
+            "running": running,
+        }
+
+    def load(self, state: dict[str, torch.Tensor]) -> None:
+        """Take over saved tensors."""
+        self.moments = RunningMoments(state["count"], state["mean"], state["variance"])
+        self.running = state["running"].numpy().copy()
+
+
+class Normalisers:
+    """Both kinds, each present only when its setting is on; one object to save, freeze and hand around."""
+
+    def __init__(self, observations: ObservationNormaliser | None, rewards: RewardNormaliser | None) -> None:
+        self.observations, self.rewards = observations, rewards
+
+    def encode(self, inputs: dict[str, Array]) -> dict[str, Array]:
+        """Raw inputs to what the networks see."""
+        if self.observations is None or "flat" not in inputs:
+            return inputs
+        return {**inputs, "flat": self.observations(inputs["flat"])}
+
+    def start(self, rollout: Any) -> None:
+        """Give the reward normaliser its first statistics: the first rollout is scaled by its own."""
+        if self.rewards is not None and float(self.rewards.moments.count) == 0:
+            self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
+            rollout.reward_statistics_taken = True
+
+    def update(self, rollout: Any) -> None:
+        """Move the statistics, after the update on this rollout."""
+        if self.observations is not None:
+            self.observations.update(rollout.raw[rollout.mask])
+        if self.rewards is not None and not rollout.reward_statistics_taken:
+            self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """All tensors, with the kind as prefix."""
+        parts = {"observations": self.observations, "rewards": self.rewards}
+        return {
+            f"{k}.{n}": x for k, part in parts.items() if part is not None for n, x in part.state().items()
+        }
+
+    def load(self, state: dict[str, torch.Tensor]) -> None:
+        """Take over what ``state`` gave. ValueError for statistics of other observations: the compiled engine
+        would read beyond them.
+        """
+        for kind, part in {"observations": self.observations, "rewards": self.rewards}.items():
+            if part is not None:
+                prefix = f"{kind}."
+                found = {k.removeprefix(prefix): x for k, x in state.items() if k.startswith(prefix)}
+                for name, own in part.state().items():
+                    if found[name].shape != own.shape or found[name].dtype != own.dtype:
+                        raise ValueError(f"{prefix}{name} is {found[name].dtype} {tuple(found[name].shape)}")
+                part.load(found)

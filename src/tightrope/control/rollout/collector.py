@@ -1,0 +1,186 @@
+"""Collecting rollouts: step the environments with the policy."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from tightrope.control.engine.base import Engine
+from tightrope.control.environments import state as states
+from tightrope.control.environments.base import Environments
+from tightrope.control.policy.normalise import Normalisers
+from tightrope.control.rollout.rollout import Array, Rollout, check_numbers, check_policy
+from tightrope.control.spaces import Inputs
+
+
+def reset_seed(seed: int, step: int) -> int:
+    """The seed of a reset at an agent step; at step 0 the run's own. Single environment i adds i."""
+    if step == 0:
+        return seed
+    return int(np.random.SeedSequence([seed, step]).generate_state(1)[0]) >> 2  # with i it fits 31 bits
+
+
+class Collector:
+    """Fills rollouts; carries observations and running episodes from one to the next."""
+
+    def __init__(
+        self, environments: Environments, normalisers: Normalisers, rng: np.random.Generator
+    ) -> None:
+        self.environments = environments
+        self.normalisers = normalisers
+        self.rng = rng
+        self._rollout: Rollout | None = None
+        self._uniform = np.concatenate(  # bool [A]: columns whose noise is uniform, not normal
+            [np.full(c.width, c.kind != "gaussian") for c in environments.action_layout.components]
+        )
+        self._step_count = 0
+        self._column = 0  # the step of the rollout that is under way
+        self._restarts = 0  # those that earlier rollouts reported
+
+    def reset(self, seed: int, step: int = 0) -> None:
+        """Start new episodes at an agent step, with seeds that depend only on (seed, step).
+
+        Those that were running are cut: their last step was bootstrapped, and they are not counted.
+        """
+        self._inputs, self._action_mask = self.environments.reset(reset_seed(seed, step))
+        self._returns = np.zeros(self.environments.num_envs)
+        self._lengths = np.zeros(self.environments.num_envs, np.int64)
+        if self.normalisers.rewards is not None:
+            self.normalisers.rewards.restart(self.environments.num_envs)
+
+    def state(self) -> dict[str, Any] | None:
+        """The running episodes, as JSON can hold them; None when the environments cannot give their state."""
+        if not self.environments.gives_state:
+            return None
+        names = ("_inputs", "_action_mask", "_returns", "_lengths")
+        episodes = {name: states.pack(getattr(self, name)) for name in names}
+        return {**episodes, "environments": self.environments.get_state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue the episodes of a `state`. ValueError for one of other environments."""
+        restarts = self.environments.restarts
+        self.environments.count_from(0)  # the reset repeats the restarts of the first time
+        inputs, action_mask = self.environments.set_state(state["environments"])
+        self.environments.count_from(restarts)
+        zeros = np.zeros(self.environments.num_envs)
+        like = {"_inputs": inputs, "_action_mask": action_mask, "_returns": zeros}
+        for name, fresh in {**like, "_lengths": zeros.astype(np.int64)}.items():
+            found = states.unpack(state[name])
+            if not states.alike(found, fresh):  # the compiled engine would read beyond it
+                raise ValueError(f"{name.strip('_')} of the episodes have another shape than here")
+            setattr(self, name, found)
+
+    def count_from(self, restarts: int) -> None:
+        """Start the restart counter here; earlier rows already reported these."""
+        self.environments.count_from(restarts)
+        self._restarts = restarts
+
+    def noise(self, num_steps: int, rows: int, rng: np.random.Generator) -> Array:
+        """[T, rows, A] float32: uniforms for categories and bits, standard normals for Gaussian columns."""
+        shape = (num_steps, rows, len(self._uniform))
+        if self._uniform.all():
+            return rng.random(shape, dtype=np.float32)
+        noise = rng.standard_normal(shape, dtype=np.float32)
+        if self._uniform.any():
+            noise[..., self._uniform] = rng.random(
+                (num_steps, rows, int(self._uniform.sum())), dtype=np.float32
+            )
+        return noise
+
+    def collect(self, engine: Engine, num_steps: int) -> Rollout:
+        """Step all environments ``num_steps`` times with the engine's policy.
+
+        The next call reuses the arrays of the rollout that it returns. The first rollout of all also starts
+        the reward normaliser, which has nothing else to scale it by.
+        """
+        rollout = self._cleared(num_steps)
+        try:
+            inputs = self._fill(rollout, engine)
+        except Exception:
+            # a NaN observation or a NaN weight is the likelier cause of what failed after it
+            self._check(rollout, engine, self._column + 1, self._inputs)
+            raise
+        self._inputs = inputs
+        self._check(rollout, engine, num_steps, inputs)
+        rollout.last = self.normalisers.encode(inputs)
+        rollout.finals = [(t, rows, self.normalisers.encode(x)) for t, rows, x in rollout.finals]
+        rollout.ended |= rollout.terminated | rollout.truncated
+        if self.environments.policy.restart:
+            rollout.restarts = self.environments.restarts - self._restarts
+            self._restarts = self.environments.restarts
+        rollout.episodes = self._count_episodes(rollout)
+        self._step_count += num_steps
+        self.normalisers.start(rollout)
+        return rollout
+
+    def _cleared(self, num_steps: int) -> Rollout:
+        rollout = self._rollout
+        if rollout is None or rollout.logp.shape[1] != num_steps:
+            keep_raw = self.normalisers.observations is not None
+            has_masks = self._action_mask is not None
+            rollout = Rollout(self.environments, num_steps, keep_raw=keep_raw, has_masks=has_masks)
+            self._rollout = rollout
+        rollout.clear()
+        return rollout
+
+    def _fill(self, rollout: Rollout, engine: Engine) -> Inputs:
+        """Act and step in every column; the observations after the last one."""
+        environments, normaliser = self.environments, self.normalisers.observations
+        num_steps = rollout.logp.shape[1]
+        self._column = 0
+        noise = self.noise(num_steps, environments.num_envs, self.rng)
+        engine.begin_rollout(environments.num_envs, self.rng)
+        inputs, action_mask, env_seconds = self._inputs, self._action_mask, 0.0
+        for t in range(num_steps):
+            self._column = t
+            if normaliser is not None:
+                rollout.raw[:, t] = inputs["flat"]
+            for rows in environments.row_groups:
+                out = rollout.acted(rows, t)
+                engine.act(inputs, normaliser, action_mask, noise[t], rows, out)
+                environments.send(rows, out.actions)
+            before = perf_counter()
+            step = environments.receive()
+            env_seconds += perf_counter() - before
+            inputs, action_mask = step.inputs, step.action_mask
+            rollout.rewards[:, t] = step.rewards
+            rollout.terminated[:, t] = step.terminated
+            rollout.truncated[:, t] = step.truncated
+            if step.phantom is not None:
+                np.logical_not(step.phantom, out=rollout.mask[:, t])
+            if step.cut is not None:
+                rollout.mask[step.cut, t] = False
+                rollout.ended[step.cut, t] = True
+            if step.final_rows is not None and step.final_inputs is not None:
+                rollout.finals.append((t, step.final_rows, step.final_inputs))
+        self._action_mask = action_mask
+        rollout.env_seconds = env_seconds
+        return inputs
+
+    def _check(self, rollout: Rollout, engine: Engine, num_steps: int, last: Inputs) -> None:
+        check_numbers(rollout, self.environments, last, num_steps, self._step_count)
+        check_policy(rollout, engine.policy, num_steps, self._step_count)
+
+    def _count_episodes(self, rollout: Rollout) -> list[tuple[float, int, bool]]:
+        """(return, length, terminated) of every episode that ended in the rollout, by column.
+
+        One that a fault cut is not an episode.
+        """
+        running = np.cumsum(np.where(rollout.mask, rollout.rewards, 0.0), axis=1) + self._returns[:, None]
+        lengths = np.cumsum(rollout.mask, axis=1) + self._lengths[:, None]
+        found = []
+        self._returns = running[:, -1].copy()
+        self._lengths = lengths[:, -1].copy()
+        for row in np.flatnonzero(rollout.ended.any(axis=1)):
+            ends = np.flatnonzero(rollout.ended[row])
+            totals, counts = running[row, ends], lengths[row, ends]
+            for k, t in enumerate(ends):
+                before = (totals[k - 1], counts[k - 1]) if k else (0.0, 0)
+                flag = bool(rollout.terminated[row, t])
+                if rollout.mask[row, t]:
+                    found.append((int(t), float(totals[k] - before[0]), int(counts[k] - before[1]), flag))
+            self._returns[row] -= totals[-1]
+            self._lengths[row] -= counts[-1]
+        return [episode[1:] for episode in sorted(found, key=lambda episode: episode[0])]

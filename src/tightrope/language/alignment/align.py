@@ -1,0 +1,168 @@
+"""The third stage: PPO on a causal language model, as one function.
+
+from tightrope.language import align
+run = align(model="path/to/model", prompts=prompts, reward=reward, total_episodes=4096, seed=1)
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tightrope.language.alignment.iteration import Trainer
+from tightrope.language.alignment.kl import bias_of
+from tightrope.language.quiet import quiet
+from tightrope.language.settings import AlignSettings
+from tightrope.language.supervised.prepare import threads
+from tightrope.runs.records import retyped
+from tightrope.runs.run import Run
+from tightrope.training import loop
+from tightrope.training.events import Listener, Listeners
+from tightrope.training.resume import continue_from, newest_point
+from tightrope.training.tensorboard import require_tensorboard
+
+__all__ = ["Aligned", "align", "resume_align"]
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A finished run: its folder, its summary, and a row of metrics per iteration."""
+
+    path: Path
+    summary: dict[str, Any]
+    metrics: list[dict[str, Any]]
+
+    @property
+    def model(self) -> Path:
+        """The folder that AutoModelForCausalLM.from_pretrained loads."""
+        return self.path / "model"
+
+
+@quiet()
+def align(
+    settings: AlignSettings | None = None,
+    *,
+    prompts: Any = None,
+    reward: Any = None,
+    gold: Any = None,
+    run_dir: str | Path | None = None,
+    listeners: Sequence[Listener] = (),
+    **values: Any,
+) -> Aligned:
+    """Train a language model against a reward; returns the run.
+
+    ``prompts``: texts, message lists or rows with a "prompt", or a file of them. ``reward``: a function as
+    TRL calls it, (function, weight), "length", FILE.py:function, the folder of a reward model, or a list of
+    these. ``gold``: another judge of the same kinds, asked on held-out prompts and never trained on.
+    Everything else is a field of AlignSettings or RLHFSettings. Raises ValueError for what cannot work,
+    before anything is trained.
+    """
+    settings = (settings or AlignSettings()).with_values(**_named(prompts, reward, gold), **values)
+    told = Listeners(listeners)
+    for risk in settings.risks():
+        told.warn(risk)
+    if (bias := bias_of(settings.kl)) is not None:
+        told.warn(f"{bias}.")
+    require_tensorboard(settings.tensorboard)
+    sources = (
+        settings.data if prompts is None else prompts,
+        settings.reward if reward is None else reward,
+        settings.gold if gold is None else gold,
+    )
+    with threads(settings.threads):
+        trainer = Trainer(settings, *sources, told)
+        name = f"align-{Path(settings.model).name}-{settings.seed}"
+        with Run.create(run_dir, trainer.settings_json(), name) as run:
+            return _train(trainer, run)
+
+
+def _train(trainer: Trainer, run: Run) -> Aligned:
+    summary = loop.train(trainer, run, trainer.listeners)
+    return Aligned(run.path, summary, run.read_metrics())
+
+
+def _named(prompts: Any, reward: Any, gold: Any) -> dict[str, str]:
+    """What settings.json says of objects that were given in Python: their names in angle brackets, for
+    display alone, so that none is taken for a file, a folder or a reward that this package knows.
+    """
+    found = {}
+    for name, value in (("data", prompts), ("reward", reward), ("gold", gold)):
+        if value is not None:
+            found[name] = (
+                str(value)
+                if isinstance(value, str | Path)
+                else f"<{getattr(value, '__name__', type(value).__name__).strip('<>')}>"
+            )
+    return found
+
+
+@quiet()
+def resume_align(
+    run_dir: str | Path,
+    *,
+    prompts: Any = None,
+    reward: Any = None,
+    gold: Any = None,
+    total_episodes: int | None = None,
+    listeners: Sequence[Listener] = (),
+) -> Aligned:
+    """Go on from a run's newest checkpoint, or from the start where there is none yet; the end is that of a
+    run without a break, bit for bit.
+
+    Code is never named by a file: a reward that was a function must be given again, and prompts that were no
+    file too. ``total_episodes`` extends a finished run.
+    """
+    with Run.open(run_dir, own=True) as run:
+        settings = AlignSettings.from_json(run.settings, run.path / "settings.json")
+        if total_episodes is not None:
+            settings = settings.with_values(total_episodes=total_episodes)
+        _require_what_no_file_gives(run_dir, settings, prompts, reward, gold)
+        sources = (
+            settings.data if prompts is None else prompts,
+            settings.reward if reward is None else reward,
+            settings.gold if gold is None else gold,
+        )
+        with threads(settings.threads):
+            trainer = Trainer(settings, *sources, Listeners(listeners))
+            _go_back(trainer, run, total_episodes)
+            return _train(trainer, run)
+
+
+def _require_what_no_file_gives(
+    run_dir: str | Path, settings: AlignSettings, prompts: Any, reward: Any, gold: Any
+) -> None:
+    """ValueError for prompts and judges that were objects and are not given again."""
+    for name, value in (("reward", reward), ("gold", gold)):
+        known = getattr(settings, name)
+        if value is None and known not in (None, "length") and not Path(known).is_dir():
+            raise ValueError(
+                f"The {name} of {run_dir} was {known!r}: code, which no file may import, or a folder that is "
+                "not there any more. If it is yours, or you have read it, name it again: tightrope resume "
+                f"{shlex.quote(str(run_dir))} --{name} {retyped(known, 'FILE.py:function')}"
+            )
+    if prompts is None and not Path(settings.data).is_file():
+        raise ValueError(
+            f"The prompts of {run_dir} were {settings.data!r}, which is no file. Give them again: "
+            f"tightrope resume {shlex.quote(str(run_dir))} --data PROMPTS.jsonl"
+        )
+
+
+def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
+    """Put trainer and run to the newest checkpoint, or to the start where there is none."""
+    settings = trainer.settings
+    point = newest_point(run, trainer.listeners)
+    if point is not None:
+        trainer.restore(point)
+    if total_episodes is not None and total_episodes < trainer.episodes:
+        raise ValueError(
+            f"{run.path} has had {trainer.episodes:,} responses already; expected total_episodes of as "
+            f"many or more, got {total_episodes:,}."
+        )
+    if point is not None and trainer.episodes >= settings.total_episodes:
+        text = f"{run.path} has its {trainer.episodes:,} responses; --total-episodes N goes on from there."
+        trainer.listeners.info(text)
+    trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
+    continue_from(trainer, run, point)

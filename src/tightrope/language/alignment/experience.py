@@ -1,0 +1,281 @@
+"""One iteration's experience: prompts -> responses -> scores -> rewards per token -> advantages -> Batch."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.memory import OutOfMemory, free, is_out_of_memory
+from tightrope.language.alignment.kl import kl_rewards
+from tightrope.language.data.batching import length_groups, pad_left
+from tightrope.language.data.examples import Prompt
+from tightrope.language.generation.distribution import token_statistics
+from tightrope.language.generation.sample import Completions, sample
+from tightrope.language.policy.roles import Roles
+from tightrope.language.policy.rollout import Experience, FirstPass, Inputs
+from tightrope.language.reward.functions import Scores
+from tightrope.language.settings import AlignSettings
+from tightrope.maths import returns
+from tightrope.maths.statistics import masked_variance
+
+
+class PromptOrder:
+    """Prompts in a new random order for every pass over them: a function of only seed and position."""
+
+    def __init__(self, count: int, seed: int) -> None:
+        self.count, self.seed, self.position = count, seed, 0
+
+    def take(self, count: int) -> list[int]:
+        """The indices of the next ``count`` prompts; ``position`` is the number taken so far."""
+        taken = []
+        for index in range(self.position, self.position + count):
+            order = np.random.default_rng([self.seed, 7, index // self.count]).permutation(self.count)
+            taken.append(int(order[index % self.count]))
+        self.position += count
+        return taken
+
+
+def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Completions:
+    """``samples`` responses of the policy to each prompt; rows of one prompt are neighbours.
+
+    Raises OutOfMemory, with advice.
+    """
+    try:
+        return _respond(roles, prompts, seed, iteration, samples)
+    except (RuntimeError, MemoryError) as error:
+        _advise_on_memory(roles, error)
+        raise
+
+
+def _respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Completions:
+    settings, begin = roles.settings, time.perf_counter()
+    device = next(roles.model.parameters()).device
+    tokens, real = (x.to(device) for x in pad_left([prompt.tokens for prompt in prompts]))
+    shape = len(prompts) * samples, settings.max_new_tokens
+    uniforms = torch.from_numpy(np.random.default_rng([seed, 8, iteration]).random(shape)).to(device)
+    with roles.frozen_policy():
+        responses = sample(
+            roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples
+        )
+    tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
+    real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
+    return Completions(tokens, real, responses, time.perf_counter() - begin, lower=None)
+
+
+def gather(
+    roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int, *, keep: bool = False
+) -> Experience:
+    """``samples`` responses to each prompt, and what policy, reference and critic compute for them.
+
+    Without gradients. With ``keep`` the pass keeps its graph, so that the first epoch can reuse it: where the
+    responses are of about one length, need no groups, and memory is enough. Raises OutOfMemory, with advice,
+    when memory runs out without ``keep`` as well.
+    """
+    answers = respond(roles, prompts, seed, iteration, samples)
+    if keep and len(length_groups(answers.real, answers.responses.mask)) == 1:
+        try:
+            return _evaluated(roles, answers, keep=True)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+        # outside the except clause, which keeps the failed pass's tensors alive
+        free()
+        return dataclasses.replace(_evaluated(roles, answers), short_of_memory=True)
+    try:
+        return _evaluated(roles, answers)
+    except (RuntimeError, MemoryError) as error:
+        _advise_on_memory(roles, error)
+        raise
+
+
+def _advise_on_memory(roles: Roles, error: RuntimeError | MemoryError) -> None:
+    """OutOfMemory, which names the settings to lower, for an error that is one of memory."""
+    if isinstance(error, OutOfMemory) or not is_out_of_memory(error):
+        return
+    reason = (str(error).splitlines() or [""])[0][:200]
+    raise OutOfMemory(
+        f"Memory is not enough to sample {roles.settings.batch_size} responses at once ({reason}). Choose a "
+        "smaller --batch-size, --max-new-tokens or --max-prompt-tokens; --micro-batch-size makes the pass "
+        "over the finished responses smaller."
+    ) from error
+
+
+def _evaluated(roles: Roles, answers: Completions, *, keep: bool = False) -> Experience:
+    settings, rows = roles.settings, len(answers.tokens)
+    size = rows if keep else settings.update.micro_batch_size or rows
+    # a folded weight rounds otherwise than weight and adapter apart, which is what trains: in float32 within
+    # the tolerance, in bfloat16 far beyond it
+    folded = settings.dtype == "float32" and not keep
+    with roles.frozen_policy() if folded else contextlib.nullcontext(), torch.set_grad_enabled(keep):
+        pieces = [_evaluate(roles, answers, slice(k, k + size)) for k in range(0, rows, size)]
+    first_pass = None
+    if keep:
+        (found,) = pieces
+        first_pass = FirstPass(found["logp"], found["entropy"], found["values"], found["exact"])
+    joined: dict[str, Any] = {
+        name: None if first is None else torch.cat([piece[name] for piece in pieces]).detach()
+        for name, first in pieces[0].items()
+    }
+    return Experience(
+        answers.tokens, answers.real, answers.responses, answers.seconds, first_pass=first_pass, **joined
+    )
+
+
+def _evaluate(roles: Roles, answers: Completions, rows: slice) -> dict[str, Any]:
+    """What the roles compute for some rows, by the names of `Experience`'s fields."""
+    tokens, real, responses = answers.tokens[rows], answers.real[rows], answers.responses
+    mask = responses.mask[rows]
+    first = tokens.shape[1] - mask.shape[1] - 1
+    lower = roles.trunk.lower(tokens, real)
+    policy = roles.policy.hidden(tokens, real, lower)
+    with torch.no_grad():
+        reference = roles.reference.hidden(tokens, real, lower)[:, first:-1]
+    support = None if responses.support is None else responses.support[rows][mask]
+    found = token_statistics(
+        policy[:, first:-1][mask], roles.trunk.parts.head, responses.tokens[rows][mask], roles.sampling,
+        support=support, reference=reference[mask], reference_head=roles.reference.trunk.parts.head,
+        ahead=roles.settings.logp_alone,
+    )  # fmt: skip
+    zeros = torch.zeros(mask.shape, device=tokens.device)
+    values, final = zeros, zeros[:, 0]
+    if roles.critic_head is not None:
+        hidden = policy if roles.critic is None else roles.critic.hidden(tokens, real, lower)
+        every = roles.critic_head(hidden[:, first:].float())[:, :, 0]
+        values = torch.where(mask, every[:, :-1], 0.0)
+        final = every.gather(1, mask.sum(1, keepdim=True))[:, 0]
+    kept = torch.where(mask[..., None], reference, 0.0) if roles.settings.exact_in_loss else None
+    return {
+        "logp": zeros.masked_scatter(mask, found.logp),
+        "entropy": zeros.masked_scatter(mask, found.entropy),
+        "exact": zeros.masked_scatter(mask, found.kl),
+        "ref_logp": zeros.masked_scatter(mask, found.reference_logp),
+        "values": values,
+        "final_values": final,
+        "lower": lower,
+        "ref_hidden": kept,
+    }
+
+
+def kl_share(experience: Experience, settings: AlignSettings, kl_beta: float) -> Tensor:
+    """What the KL to the reference adds to the reward of each token, [B, R]; 0 where it is all in the loss.
+
+    Its log-probabilities are those of the pass that trains, for policy and reference alike: before the first
+    step they are equal to the bit, where those of sampling differ by rounding, which normalised advantages
+    would blow up to full strength.
+    """
+    return kl_rewards(
+        settings.kl,
+        kl_beta,
+        logp=experience.logp,
+        ref_logp=experience.ref_logp,
+        exact=experience.exact,
+        mask=experience.responses.mask,
+        gamma=settings.update.gamma,
+    )
+
+
+def rewards_of(
+    experience: Experience, scores: Scores, settings: AlignSettings, kl_beta: float
+) -> tuple[Tensor, float]:
+    """Rewards per token [B, R]: what the KL costs, and the score on the last real token.
+
+    With them what they were multiplied by: 1, or with ``whiten_rewards`` one over their deviation.
+    """
+    mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
+    total = torch.from_numpy(np.nan_to_num(scores.total)).to(experience.logp) * settings.reward_scale
+    if settings.reward_clip is not None:
+        total = total.clamp(-settings.reward_clip, settings.reward_clip)
+    if settings.missing_eos_penalty is not None:
+        total = torch.where(experience.responses.ended, total, total - settings.missing_eos_penalty)
+    found = kl_share(experience, settings, kl_beta)
+    found[rows, experience.last] += total
+    if not settings.whiten_rewards:
+        return found, 1.0
+    counting = mask & torch.from_numpy(scores.valid).to(mask.device)[:, None]
+    scale = 1.0 / (float(masked_variance(found, counting).sqrt()) + 1e-8) if bool(counting.any()) else 1.0
+    return torch.where(mask, found * scale, 0.0), scale
+
+
+def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: AlignSettings) -> Batch:
+    """Advantages and returns of the responses whose score counts (``valid`` [B]), as ppo.update takes
+    them.
+    """
+    mask, last = experience.responses.mask, experience.last
+    rows = torch.arange(len(mask))
+    ended = torch.zeros_like(mask)
+    ended[rows, last] = True
+    terminated = ended.clone()
+    if settings.truncation == "bootstrap":
+        terminated[rows, last] = experience.responses.ended
+    update, values = settings.update, experience.values
+    if settings.critic == "none":
+        advantages = leave_one_out(rewards, mask, valid, settings.samples_per_prompt, settings.update.gamma)
+        targets = torch.zeros_like(rewards)
+    else:
+        following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], 1)
+        following = torch.where(ended, experience.final_values[:, None], following)
+        policy_lambda: Any = update.gae_lambda
+        if settings.lambda_alpha is not None:
+            policy_lambda = length_lambda(mask.sum(1), settings.lambda_alpha)
+        critic_lambda = update.gae_lambda if settings.critic_lambda is None else settings.critic_lambda
+        estimate = functools.partial(
+            returns.gae,
+            rewards=rewards,
+            values=values,
+            next_values=following,
+            terminated=terminated,
+            ended=ended,
+            gamma=update.gamma,
+            mask=mask,
+        )
+        advantages = estimate(gae_lambda=policy_lambda)
+        one_lambda = settings.lambda_alpha is None and critic_lambda == policy_lambda
+        targets = (advantages if one_lambda else estimate(gae_lambda=critic_lambda)) + values
+    old = experience.responses.logp if settings.dtype == "float32" else experience.logp
+    inputs = Inputs(
+        tokens=experience.tokens,
+        real=experience.real,
+        ref_logp=experience.ref_logp,
+        row=torch.arange(len(mask), device=mask.device),
+        lower=experience.lower,
+        ref_hidden=experience.ref_hidden,
+        support=experience.responses.support,
+    )
+    batch = Batch(inputs.as_dict(), experience.responses.tokens, old, values, advantages, targets, mask)
+    return batch.select(valid.nonzero()[:, 0])
+
+
+def length_lambda(lengths: Tensor, alpha: float) -> Tensor:
+    """VAPO's length-adaptive lambda [B]: max(0, 1 - 1 / (alpha l)) of a response of l tokens."""
+    return (1.0 - 1.0 / (alpha * lengths.float())).clamp(min=0.0)
+
+
+def comparable(valid: np.ndarray, samples: int) -> np.ndarray:
+    """Of responses whose score counts [B], those that another response to the same prompt, whose score counts
+    too, can be compared with.
+    """
+    together = valid.reshape(-1, samples)
+    return (together & (together.sum(1, keepdims=True) > 1)).reshape(-1)
+
+
+def leave_one_out(rewards: Tensor, mask: Tensor, valid: Tensor, samples: int, gamma: float = 1.0) -> Tensor:
+    """Advantages without a critic: reward to go minus the mean return of the prompt's *other* responses.
+
+    The baseline does not depend on the response it is subtracted from, so it adds no bias (Kool et al. 2019).
+    Rows of one prompt are neighbours; a response whose score does not count is nobody's baseline.
+    """
+    ended = torch.zeros_like(mask)
+    to_go = returns.discounted_returns(rewards, ended, gamma, mask=mask)
+    total = torch.where(valid & mask[:, 0], to_go[:, 0], 0.0).view(-1, samples)
+    count = valid.view(-1, samples).to(total)
+    others = (total.sum(1, keepdim=True) - total) / (count.sum(1, keepdim=True) - count).clamp(min=1)
+    return torch.where(mask, to_go - others.view(-1, 1), 0.0)

@@ -1,0 +1,118 @@
+"""The metrics of a rollout, and what is refused before anything is learned from it: numbers that are not
+finite, and probabilities that are not those of sampling.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
+from tightrope.algorithms.optimise import SamplingMismatch
+from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.policy.rollout import Experience
+from tightrope.language.reward.functions import Scores
+from tightrope.maths import divergence
+from tightrope.maths.statistics import masked_mean, masked_sum
+
+
+def describe(
+    experience: Experience, scores: Scores, rewards: Tensor, kl_share: Tensor, valid: Tensor
+) -> dict[str, float]:
+    """The metrics of a rollout: sums over a response, and token means under names that say so. ``rewards``
+    and the share of the KL in them, before any scaling, are [B, R].
+
+    Scores and rewards are those of the responses that count, everything else is of all of them; NaN for a
+    score where none counts.
+    """
+    mask, ended = experience.responses.mask, experience.responses.ended
+    log_ratio = torch.where(mask, experience.ref_logp - experience.logp, 0.0)
+    total = scores.total[scores.valid]
+    nan = float("nan")
+    estimators = {
+        "objective/kl": divergence.k1,
+        "objective/kl_k2": divergence.k2,
+        "objective/kl_k3": divergence.k3,
+    }
+    kls = {name: estimate(log_ratio) for name, estimate in estimators.items()}
+    per_token = {
+        "objective/kl_token_mean": kls["objective/kl"],
+        "objective/entropy_token_mean": -experience.logp,
+    }
+    per_response = {
+        **kls,
+        "objective/kl_exact": experience.exact,
+        "objective/entropy": -experience.logp,
+        "objective/entropy_exact": experience.entropy,
+    }
+    per_scored_response = {"objective/rlhf_reward": rewards, "objective/non_score_reward": kl_share}
+    counting = mask & valid[:, None]
+    gap = (experience.responses.logp - experience.logp)[mask].abs()
+    return {
+        **{name: float(masked_sum(x, mask)) / len(mask) for name, x in per_response.items()},
+        **{
+            name: float(masked_sum(x, counting)) / len(total) if len(total) else nan
+            for name, x in per_scored_response.items()
+        },
+        **{name: float(masked_mean(x, mask)) for name, x in per_token.items()},
+        "objective/scores": float(np.mean(total)) if len(total) else nan,
+        "objective/scores_std": float(np.std(total)) if len(total) else nan,
+        "objective/response_length": float(mask.sum()) / len(mask),
+        "objective/eos_fraction": float(ended.float().mean()),
+        "objective/truncated_fraction": float((~ended).float().mean()),
+        "objective/masked_samples": float((~valid).sum()),
+        "objective/distinct_2": distinct(experience.ids()),
+        "objective/sampling_gap": float(gap.max()) if gap.numel() else 0.0,
+        "time/generate_seconds": experience.seconds,
+        "time/tokens_per_second": float(mask.sum()) / max(experience.seconds, 1e-9),
+    }
+
+
+def distinct(rows: list[list[int]], n: int = 2) -> float:
+    """Distinct n-grams / all n-grams over a batch: falls towards 0 when responses repeat themselves."""
+    grams = [tuple(row[k : k + n]) for row in rows for k in range(len(row) - n + 1)]
+    return len(set(grams)) / len(grams) if grams else 1.0
+
+
+def refuse_bad_numbers(experience: Experience, weights: Iterable[tuple[str, Tensor]]) -> None:
+    """NonFiniteError when a role computed a number that is not finite; the first bad one of the named
+    ``weights`` is part of the message.
+    """
+    figures = (
+        ("log-probability of sampling", experience.responses.logp),
+        ("log-probability", experience.logp),
+        ("log-probability of the reference", experience.ref_logp),
+        ("entropy", experience.entropy),
+        ("KL to the reference", experience.exact),
+        ("value", experience.values),
+    )
+    mask = experience.responses.mask
+    found = first_bad([(f"The {name} of response, token ", torch.where(mask, x, 0.0)) for name, x in figures])
+    if found is None:
+        return
+    weight = first_bad((f"the weight {name}", p) for name, p in weights)
+    raise NonFiniteError(
+        f"{found}; expected a finite number, but {weight or 'every weight is one: sums overflow'}. Nothing "
+        "was learned from this batch. Look for a learning rate that is too high."
+    )
+
+
+def refuse_mismatch(gap: float, dtype: str, *, first: bool) -> None:
+    """SamplingMismatch when log-probabilities of sampling and of the pass that trains are further apart, in
+    nats, than rounding can be. ``first``: nothing was learned yet.
+    """
+    limit = log_ratio_limit(dtype)
+    # the tail of rounding errors grows with the tokens of a run: in bfloat16 only the beginning is checked
+    checked = dtype == "float32" or first or not math.isfinite(gap)
+    if checked and not gap <= limit:
+        raise SamplingMismatch(
+            f"The log-probabilities of sampling and of the forward pass that trains differ by {gap:.3g} "
+            f"nats (limit {limit:g} in {dtype}). Likely causes: the model computes other numbers with its KV "
+            "cache, layers that look back over a window or were shared wrongly, a module that "
+            "draws random numbers, or too coarse a precision. See tightrope doctor --model, and try --dtype "
+            "float32, or lora_layers left out."
+        )

@@ -1,0 +1,434 @@
+"""The state and the iteration of an alignment run: sample -> score -> advantages -> update."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tightrope.algorithms import ppo
+from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
+from tightrope.language.alignment.experience import (
+    PromptOrder,
+    comparable,
+    gather,
+    kl_share,
+    respond,
+    rewards_of,
+    to_batch,
+)
+from tightrope.language.alignment.figures import describe, refuse_bad_numbers, refuse_mismatch
+from tightrope.language.alignment.kl import AdaptiveKL, kl_loss, shared_scale
+from tightrope.language.alignment.monitor import Monitor
+from tightrope.language.alignment.ptx import Pretraining
+from tightrope.language.alignment.samples import sample_rows
+from tightrope.language.data.examples import Prompt, hold_out_prompts, read_prompts, read_rows
+from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.model.packaged import find_model
+from tightrope.language.model.parts import context_length
+from tightrope.language.model.saving import save_adapter, write_model
+from tightrope.language.policy.policy_model import PolicyModel
+from tightrope.language.policy.roles import Roles, make_roles
+from tightrope.language.policy.rollout import Experience, FirstPass
+from tightrope.language.reward.call import RewardError
+from tightrope.language.reward.judge import (
+    Judge,
+    critic_from_reward,
+    is_folder,
+    make_judge,
+    reward_adapter,
+    shares_trunk,
+)
+from tightrope.language.settings import AlignSettings
+from tightrope.maths.values import explained_variance
+from tightrope.runs.checkpoint import understood
+from tightrope.runs.durable import whole
+from tightrope.runs.history import Checkpoint
+from tightrope.runs.run import Run
+from tightrope.training.events import Listeners
+from tightrope.training.learner import Update, crosses
+from tightrope.training.parameters import Tensors, put_back, tensors_of
+
+
+class Trainer:
+    """The state of an alignment run, a `Learner`."""
+
+    def __init__(
+        self, settings: AlignSettings, prompts: Any, reward: Any, gold: Any, listeners: Listeners
+    ) -> None:
+        self.settings, self.listeners = settings, listeners
+        adapter = reward_adapter(reward)
+        lora = settings.tune == "lora"
+        shared = adapter is not None and lora and shares_trunk(adapter, find_model(settings.model))
+        on_trunk = adapter if shared else None
+        self.roles: Roles = make_roles(
+            settings,
+            on_trunk,
+            listeners.tell,
+            own_reward=on_trunk is None and is_folder(reward),
+        )
+        self.prompts = self._read_prompts(prompts)
+        self.judge = make_judge(reward, self.roles, on_trunk=on_trunk, timeout=settings.reward_timeout)
+        self.held_out: list[Prompt] = []
+        self.gold: Judge | None = None
+        if gold is not None:
+            self.gold = make_judge(gold, self.roles, on_trunk=None, timeout=settings.reward_timeout)
+            self.prompts, self.held_out = hold_out_prompts(self.prompts, settings.held_out_prompts)
+        if settings.critic_from_reward:
+            critic_from_reward(self.judge, self.roles, reward)
+        self.optimiser = make_optimiser(
+            self.roles.parameters(), self.roles.critic_parameters(), settings.update
+        )
+        self.order = PromptOrder(len(self.prompts), settings.seed)
+        self.update_rng = np.random.default_rng([settings.seed, 9])
+        self.kl_beta = settings.kl_beta
+        self.pretraining = (
+            Pretraining.make(settings, self.roles, listeners.warn) if settings.ptx_weight else None
+        )
+        self.monitor = Monitor(kl_budget=settings.kl_budget)
+        self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
+        self.seconds, self.rollbacks, self.newest = 0.0, 0, dict[str, float]()
+        self.changes: dict[str, Any] = {}
+        self.micro_batch_size = settings.update.micro_batch_size  # halved when memory runs out
+        self._told = set[tuple[str, str]]()
+
+    def _read_prompts(self, source: Any) -> list[Prompt]:
+        settings, limit = self.settings, context_length(self.roles.model)
+        if limit is not None and settings.max_prompt_tokens + settings.max_new_tokens > limit:
+            raise ValueError(
+                f"max_prompt_tokens {settings.max_prompt_tokens} + max_new_tokens {settings.max_new_tokens} "
+                f"exceed the model's context of {limit} tokens. Choose less of either."
+            )
+        rows, longest = read_rows(source), settings.max_prompt_tokens
+        found = read_prompts(rows, self.roles.tokenizer, max_tokens=longest, notify=self.listeners.warn)
+        if not found:
+            raise ValueError("There are no prompts. Give a list of texts, or a file with a 'prompt' a row.")
+        return found
+
+    # ---------------------------------------------------------------------------------------------- the run
+
+    @property
+    def position(self) -> int:
+        """Responses so far."""
+        return self.episodes
+
+    @property
+    def total(self) -> int:
+        """Responses of the whole run."""
+        return self.settings.total_episodes
+
+    @property
+    def complete(self) -> bool:
+        """Whether the budget is spent, of responses or of KL."""
+        return not self._next_prompts()
+
+    @property
+    def merit(self) -> float | None:
+        """The newest gold score."""
+        return self.monitor.newest_gold
+
+    def settings_json(self) -> dict[str, Any]:
+        """The content of settings.json."""
+        return self.settings.to_json()
+
+    def changeable(self) -> Any:
+        """The settings of which some can be changed during the run: the update rule's."""
+        return self.settings.update
+
+    def begin(self) -> list[str]:
+        """The lines that describe the models."""
+        return self.roles.lines()
+
+    def evaluate(self, update: Update | None) -> dict[str, float]:
+        """Nothing: the gold judge is asked before an iteration, so that score and KL are of one policy."""
+        if update is not None:
+            self.newest = update.metrics
+        return {}
+
+    def conclude(self) -> dict[str, float]:
+        """Nothing: the figures of the last iteration are the final ones."""
+        return {}
+
+    def finish(self, run: Run) -> dict[str, Any]:
+        """Write the model; returns the summary."""
+        save_model(self.roles, run.path, self.settings)
+        rows = run.read_metrics()
+        if rows and not any("train/minibatches" in row for row in rows):
+            self.listeners.warn(
+                "not one step was taken: no response had a score that counts. The model is as it was."
+            )
+        shown = ("objective/", "eval/")
+        return {
+            "model": self.settings.model,
+            "seed": self.settings.seed,
+            "episodes": self.episodes,
+            "iterations": self.iteration,
+            "wall_seconds": self.newest.get("time/seconds", 0.0),
+            "stopped_early": self.stopped,
+            "run_dir": str(run.path),
+            "final": {name: value for name, value in self.newest.items() if name.startswith(shown)},
+        }
+
+    def _next_prompts(self) -> int:
+        """Prompts of the next iteration; 0 at the end of the budget."""
+        if self.stopped:
+            return 0
+        left = self.settings.total_episodes - self.episodes
+        return max(0, min(self.settings.batch_size, left)) // self.settings.samples_per_prompt
+
+    def _reached(self, fraction: float | None) -> bool:
+        """Whether the newest iteration, which like all but the last one was of the full size, came to a point
+        of this grid.
+        """
+        samples = self.settings.samples_per_prompt
+        before = self.episodes - self.settings.batch_size // samples * samples
+        return crosses(max(0, before), self.episodes, self.settings.total_episodes, fraction)
+
+    def _watch(self, metrics: dict[str, float]) -> None:
+        """Over-optimisation: warn, and stop at the KL budget before another step is taken."""
+        seen = (metrics["objective/kl"], metrics["objective/scores"], metrics.get("eval/gold"))
+        for alarm in self.monitor.add(*seen):
+            self.listeners.warn(alarm.text)
+            self.stopped = self.stopped or alarm.stop
+        metrics |= self.monitor.metrics()
+
+    # ------------------------------------------------------------------------------------------ the state
+
+    def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
+        """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
+        state: dict[str, Any] = {
+            "story": "align",
+            "episodes": self.episodes,
+            "iteration": self.iteration,
+            "kl_beta": self.kl_beta,
+            "rollbacks": self.rollbacks,
+            "micro_batch_size": self.micro_batch_size,
+            "prompt_position": self.order.position,
+            "prompts_sha256": self._hash_of_prompts(),
+            "rng": {"update": self.update_rng.bit_generator.state},
+            "monitor": self.monitor.state(),
+            "stopped": self.stopped,
+            "newest": self.newest,
+            "seconds": self.seconds,
+        }
+        if self.pretraining is not None:
+            state["rng"]["ptx"] = self.pretraining.rng.bit_generator.state
+        return tensors_of(self.roles.parameters(), self.optimiser), state
+
+    def restore(self, point: Checkpoint) -> None:
+        """Put back a checkpoint of a run with the same settings. ValueError for one of another command or
+        of other prompts.
+        """
+        folder, tensors, state = point
+        if state.get("story") != "align":
+            raise ValueError(f"{folder} is no checkpoint of an alignment run.")
+        if state.get("prompts_sha256") != self._hash_of_prompts():
+            raise ValueError(
+                f"{folder} is of a run with other prompts than these {len(self.prompts):,}. Give those that "
+                "the run began with, or begin a new run."
+            )
+        with understood(folder):
+            put_back(tensors, self.roles.parameters(), self.optimiser)
+            self.episodes = int(state["episodes"])
+            self.iteration = int(state["iteration"])
+            self.kl_beta = float(state["kl_beta"])
+            self.rollbacks = int(state.get("rollbacks", 0))
+            self.micro_batch_size = state.get("micro_batch_size", self.micro_batch_size)
+            self.order.position = int(state["prompt_position"])
+            self.update_rng.bit_generator.state = state["rng"]["update"]
+            self.monitor.restore(state["monitor"])
+            self.stopped = bool(state["stopped"])
+            self.seconds = float(state["seconds"])
+            self.newest = {k: math.nan if x is None else float(x) for k, x in state["newest"].items()}
+            if self.pretraining is not None:
+                self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
+
+    def roll_back(self, point: Checkpoint) -> None:
+        """Go back to a checkpoint of this run; random numbers from there on depend on the seed, the episode
+        and the number of rollbacks. The micro-batch that fits into memory is kept.
+        """
+        rollbacks, size = self.rollbacks + 1, self.micro_batch_size
+        self.restore(point)
+        self.rollbacks = rollbacks
+        self.micro_batch_size = size
+        other = np.random.default_rng([self.settings.seed, 9, self.episodes, rollbacks])
+        self.update_rng.bit_generator.state = other.bit_generator.state
+
+    def _hash_of_prompts(self) -> str:
+        digest = hashlib.sha256()
+        for prompt in (*self.prompts, *self.held_out):
+            digest.update(repr(prompt.tokens).encode())
+        return digest.hexdigest()
+
+    # ---------------------------------------------------------------------------------------- an iteration
+
+    def iterate(self) -> Iterator[Update]:
+        """One iteration at a time."""
+        while count := self._next_prompts():
+            yield self._one_iteration([self.prompts[i] for i in self.order.take(count)])
+
+    def _one_iteration(self, prompts: Sequence[Prompt]) -> Update:
+        """sample -> score -> advantages -> update."""
+        settings, gold, before = self.settings, dict[str, float](), self.episodes
+        pause = time.perf_counter()
+        if self.gold is not None and (not self.episodes or self._reached(settings.evaluate_every)):
+            gold = self.gold_scores()  # of the policy that samples next, whose KL is in the same row
+        begin = time.perf_counter()
+        pause = begin - pause
+        present = settings.update.unchecked(**self.changes).at(self.episodes / settings.total_episodes)
+        set_learning_rates(self.optimiser, present)
+        stream = settings.seed + 2**40 * self.rollbacks  # not the numbers that led to a NaN
+        keep = (
+            settings.one_pass and self.micro_batch_size is None and self.iteration >= settings.critic_warmup
+        )
+        given = (stream, self.iteration, settings.samples_per_prompt)
+        experience = gather(self.roles, prompts, *given, keep=keep)
+        if experience.short_of_memory:
+            self._smaller(len(experience.tokens))
+        refuse_bad_numbers(experience, self.roles.named_parameters())
+        gathered = time.perf_counter()
+        asked = [prompt for prompt in prompts for _ in range(settings.samples_per_prompt)]
+        scores = self.judge(asked, experience, self._trainer_state())
+        scored = time.perf_counter()
+        self._tell_faults(scores)
+        if settings.critic == "none":
+            scores.valid[:] = comparable(scores.valid, settings.samples_per_prompt)
+        rewards, self.reward_scale = rewards_of(experience, scores, settings, self.kl_beta)
+        valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
+        batch = to_batch(experience, rewards, valid, settings)
+        share = kl_share(experience, settings, self.kl_beta)
+        plain = rewards / self.reward_scale  # the metrics are those before whiten_rewards
+        metrics = describe(experience, scores, plain, share, valid) | scores.metrics | gold
+        refuse_mismatch(metrics["objective/sampling_gap"], settings.dtype, first=not self.iteration)
+        self._watch(metrics)
+        judged = time.perf_counter()
+        if len(batch) and not self.stopped:
+            metrics |= self._update(batch, present, experience)
+            if settings.critic != "none":
+                metrics["train/explained_variance"] = float(
+                    explained_variance(batch.old_values, batch.returns, batch.mask)
+                )
+        metrics["objective/kl_beta"] = self.kl_beta
+        metrics["train/learning_rate"] = present.learning_rate
+        metrics["time/score_seconds"] = scored - gathered
+        metrics["time/update_seconds"] = time.perf_counter() - judged
+        if settings.kl_goal is not None and len(batch):
+            controller = AdaptiveKL(self.kl_beta, settings.kl_goal, settings.kl_horizon)
+            self.kl_beta = controller.next(metrics["objective/kl"], len(asked)).kl_beta
+        self.episodes += len(asked)
+        self.iteration += 1
+        seconds = metrics["time/update_seconds"] + scored - begin
+        metrics["time/fps"] = float(experience.responses.mask.sum()) / seconds
+        rows = sample_rows(self.roles.tokenizer, asked, experience, scores, batch, valid, self.episodes)
+        on_grid = self._reached(settings.checkpoint_every)
+        return Update(self.episodes, self.total, metrics, before, on_grid=on_grid, samples=rows, pause=pause)
+
+    def _update(self, batch: Batch, present: Any, experience: Experience) -> dict[str, float]:
+        """PPO, or the critic alone while it warms up."""
+        warming = self.iteration < self.settings.critic_warmup
+        exact = self.settings.exact_in_loss
+        model = PolicyModel(
+            self.roles, exact=exact, critic_only=warming, first_pass=experience.take_first_pass()
+        )
+        if warming:
+            batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
+            present = present.unchecked(entropy_weight=0.0, target_kl=None)
+        limit = log_ratio_limit(self.settings.dtype)
+        kl_weight = self.kl_beta * self.reward_scale  # a KL in the loss is scaled as the rewards were
+        if present.normalise_advantages and not self.settings.kl.endswith("reward"):
+            # one scale for the whole rollout, so that a KL in the loss keeps its price in units of the reward
+            advantages, scale = shared_scale(batch.advantages, batch.mask)
+            batch = dataclasses.replace(batch, advantages=advantages)
+            kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
+        extra = None if warming else self._extra_loss(kl_weight)
+        present = present.unchecked(micro_batch_size=self.micro_batch_size)
+        given = (model, self.optimiser, batch, present, self.update_rng)
+        draw = None if extra is None or self.pretraining is None else self.pretraining.draw
+        metrics = ppo.update(*given, extra_loss=extra, draw=draw, log_ratio_limit=limit)
+        if "train/micro_batch_size" in metrics:
+            self._smaller(int(metrics["train/micro_batch_size"]))
+        return metrics
+
+    def _smaller(self, size: int) -> None:
+        """Memory ran out: ``size`` responses a pass from now on."""
+        self.micro_batch_size = size
+        self.listeners.warn(
+            f"memory ran out; from now on {size} responses a pass, and none is kept for the update. The "
+            f"gradient is the same. Say --micro-batch-size {size} to begin with it."
+        )
+
+    def _extra_loss(self, kl_weight: float) -> Any:
+        """The KL's share in the loss and the pretraining loss; None when neither is asked for."""
+        form, pretraining = self.settings.kl, self.pretraining
+
+        def extra(model: Any, part: Batch, now: FirstPass, count: Tensor) -> tuple[Tensor, dict[str, Any]]:
+            total, booked = now.logp.new_zeros(()), dict[str, Any]()
+            log_ratio = now.logp.detach() - part.old_logp
+            kl = kl_loss(form, now.logp, part.inputs["ref_logp"], now.kl, part.mask, count, log_ratio)
+            if kl is not None:
+                total = total + kl_weight * kl
+                booked["kl_loss"] = kl.detach() * count / part.mask.sum().clamp(min=1) * part.mask
+            if pretraining is not None:
+                # a sum over the texts of one response beside a sum over the response, as in InstructGPT
+                loss, tokens = pretraining.loss(part.inputs["ptx"])
+                total = total + self.settings.ptx_weight * loss / (pretraining.per_response * count)
+                booked["ptx_loss"] = loss, tokens
+            return total, booked
+
+        return extra if not form.endswith("reward") or pretraining is not None else None
+
+    def _tell_faults(self, scores: Any, judge: str = "") -> None:
+        """Say once a run for each function and kind why samples are left out; the count is a metric."""
+        for fault in scores.faults:
+            if (judge + fault.function, fault.kind) not in self._told:
+                self._told.add((judge + fault.function, fault.kind))
+                self.listeners.warn(judge + fault.text)
+
+    def _trainer_state(self) -> SimpleNamespace:
+        """What TRL's reward functions may look at: iterations so far and in all, passes over the prompts."""
+        return SimpleNamespace(
+            global_step=self.iteration,
+            max_steps=-(-self.settings.total_episodes // self.settings.batch_size),
+            epoch=self.order.position / self.order.count,
+            episode=self.episodes,
+        )
+
+    def gold_scores(self) -> dict[str, float]:
+        """The mean gold score of responses to held-out prompts, sampled as in training, as many at a time;
+        and how many of them the judge gave no score.
+        """
+        assert self.gold is not None
+        size, seed, found = self.settings.batch_size, self.settings.seed + 1_000_003, list[np.ndarray]()
+        for number, start in enumerate(range(0, len(self.held_out), size)):
+            prompts = self.held_out[start : start + size]
+            answers = respond(self.roles, prompts, seed, number, 1)
+            try:
+                scores = self.gold(prompts, answers, self._trainer_state())
+            except RewardError as error:
+                raise RewardError(f"The gold judge: {error}") from error
+            self._tell_faults(scores, "the gold judge: ")
+            found.append(scores.total[scores.valid])
+        judged = np.concatenate(found)
+        mean = float(judged.mean()) if len(judged) else float("nan")
+        return {"eval/gold": mean, "eval/gold_masked": float(len(self.held_out) - len(judged))}
+
+
+def save_model(roles: Roles, path: Path, settings: AlignSettings) -> None:
+    """RUN/model for AutoModelForCausalLM.from_pretrained, tokenizer and chat template included; with LoRA the
+    adapter is folded in, and lies in RUN/adapter for PEFT as well.
+    """
+    name = "policy" if settings.tune == "lora" else None
+    write_model(roles.model, roles.tokenizer, path / "model", name)
+    if name is not None:
+        with whole(path / "adapter") as folder:
+            save_adapter(roles.model, name, folder, base_model=find_model(settings.model))

@@ -1,0 +1,207 @@
+"""What the model writes, for people to read: rows of samples.jsonl, and tables of them in the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from tightrope.maths import divergence
+from tightrope.maths.statistics import masked_mean, masked_sum
+from tightrope.runs.records import read_lines
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from tightrope.algorithms.batch import Batch
+    from tightrope.language.data.examples import Prompt
+    from tightrope.language.policy.rollout import Experience
+    from tightrope.language.reward.functions import Scores
+
+LONGEST = 300  # characters of a prompt or response in a table
+
+
+def sample_rows(
+    tokenizer: Any,
+    prompts: Sequence[Prompt],
+    experience: Experience,
+    scores: Scores,
+    batch: Batch,
+    valid: Tensor,
+    step: int,
+) -> list[dict[str, Any]]:
+    """One row per response of a rollout, in its order, as samples.jsonl holds them.
+
+    ``step``: responses so far. ``prompt`` and ``response`` are text or messages; ``score`` the weighted sum
+    and ``scores`` each function's own, None where there is none; ``kl`` to the reference in nats, k1 summed
+    over the response; ``advantage`` the mean over its tokens, None where the response is masked (``counts``
+    False); ``tokens`` its length, ``ended`` whether it closed itself with an EOS; ``extras`` what reward
+    functions logged. ``batch`` holds the rows of ``valid`` [B] alone.
+    """
+    responses = experience.responses
+    log_ratio = experience.ref_logp - experience.logp
+    texts = [tokenizer.decode(ids, skip_special_tokens=True) for ids in experience.ids()]
+    places = {row: place for place, row in enumerate(valid.nonzero()[:, 0].tolist())}
+    rows = []
+    for index, (prompt, text) in enumerate(zip(prompts, texts, strict=True)):
+        mask, place = responses.mask[index], places.get(index)
+        advantage = None if place is None else masked_mean(batch.advantages[place], batch.mask[place])
+        rows.append(
+            {
+                "step": step,
+                "prompt": _writable(prompt.shown),
+                "response": _writable(text),
+                "score": _finite(scores.total[index]) if place is not None else None,
+                "scores": {name: _finite(part[index]) for name, part in scores.parts.items()},
+                "kl": _finite(masked_sum(divergence.k1(log_ratio[index]), mask)),
+                "advantage": _finite(advantage),
+                "tokens": int(mask.sum()),
+                "ended": bool(responses.ended[index]),
+                "counts": place is not None,
+                "extras": {column: _writable(values[index]) for column, values in scores.extras.items()},
+            }
+        )
+    return rows
+
+
+def read_samples(path: str | Path) -> list[dict[str, Any]]:
+    """The rows of a run folder's samples.jsonl, or of such a file; a line torn by a crash is left out.
+
+    ValueError where there is none: the run recorded no responses.
+    """
+    path = Path(path)
+    file = path / "samples.jsonl" if path.is_dir() else path
+    if not file.is_file():
+        raise ValueError(f"{file} is not there: {path} is no run of tightrope align, or has not begun.")
+    rows = read_lines(file)
+    for number, row in enumerate(rows):
+        if not _is_sample(row):
+            raise ValueError(f"{file}, row {number}, is no response as tightrope align records them.")
+    return rows
+
+
+def _is_sample(row: dict[str, Any]) -> bool:
+    """Whether a row has what tables show of it, whoever wrote the file."""
+    scores = row.get("scores")
+    texts = (row.get("prompt"), row.get("response"))
+    numbers = [row.get(name) for name in ("score", "kl", "advantage")]
+    numbers += scores.values() if isinstance(scores, dict) else [""]
+    return (
+        all(isinstance(text, str | list) and all(isinstance(m, str | dict) for m in text) for text in texts)
+        and all(number is None or isinstance(number, int | float) for number in numbers)
+        and isinstance(row.get("step"), int)
+        and isinstance(row.get("counts"), bool)
+    )
+
+
+def spread(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
+    """``count`` rows from the highest score to the lowest at even distances; those without a score come last.
+
+    A look at the best alone hides what happens to the others. ValueError for a count below 1.
+    """
+    if count < 1:
+        raise ValueError(f"count is {count}, expected at least 1.")
+    ordered = sorted(rows, key=lambda row: -math.inf if row["score"] is None else row["score"], reverse=True)
+    if len(ordered) <= count:
+        return ordered
+    if count == 1:
+        return ordered[:1]
+    return [ordered[round(i * (len(ordered) - 1) / (count - 1))] for i in range(count)]
+
+
+def print_samples(
+    rows: Sequence[dict[str, Any]],
+    stream: TextIO | None = None,
+    *,
+    width: int | None = None,
+    title: str = "",
+    console: Any = None,
+) -> None:
+    """A table of prompt, response, each function's score, their sum where there are several, KL, advantage.
+
+    ``stream``: stdout by default; ``width``: characters, by default the terminal's; ``console``: rich's, in
+    their place, where a progress bar owns the terminal. Control characters that a model may write do not
+    reach the terminal.
+    """
+    names = list(dict.fromkeys(name for row in rows for name in row["scores"]))
+    heads = [*names, *(["score"] if len(names) > 1 else []), "KL", "advantage"]
+    lines = []
+    for row in rows:
+        figures = [row["scores"].get(name) for name in names]
+        figures += [row["score"]] if len(names) > 1 else []
+        lines.append([shown(row["prompt"], tail=True), shown(row["response"]), *map(figure, figures)])
+        lines[-1] += [figure(row["kl"]), figure(row["advantage"]) if row["counts"] else "masked"]
+    _print_table(["prompt", "response"], heads, lines, stream, width, title, console)
+
+
+def print_comparison(
+    rows: Sequence[dict[str, Any]], stream: TextIO | None = None, *, width: int | None = None, title: str = ""
+) -> None:
+    """A table of responses before and after training: rows of ``prompt``, ``before``, ``after``, and, where
+    there is a reward, ``score_before`` and ``score_after``. ``stream`` and ``width`` as in `print_samples`.
+    """
+    scored = any(row.get("score_before") is not None or row.get("score_after") is not None for row in rows)
+    lines = []
+    for row in rows:
+        texts = [shown(row["prompt"], tail=True), shown(row["before"]), shown(row["after"])]
+        figures = [figure(row.get("score_before")), figure(row.get("score_after"))] if scored else []
+        lines.append(texts + figures)
+    heads = ["score before", "after"] if scored else []
+    _print_table(["prompt", "before", "after"], heads, lines, stream, width, title)
+
+
+def shown(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
+    """A text or messages in one short line for a table.
+
+    Line ends and other characters that cannot be seen are written as Python writes them. The beginning is
+    kept, or with ``tail`` the end.
+    """
+    if not isinstance(text, str):
+        text = "\n".join(f"{message.get('role', '')}: {message.get('content', '')}" for message in text)
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    if len(line) <= LONGEST:
+        return line
+    return "..." + line[3 - LONGEST :] if tail else line[: LONGEST - 3] + "..."
+
+
+def figure(value: float | None) -> str:
+    """A number in few characters, ``-`` for none."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
+
+
+def _print_table(
+    texts: list[str],
+    figures: list[str],
+    lines: list[list[str]],
+    stream: TextIO | None,
+    width: int | None,
+    title: str,
+    console: Any = None,
+) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title or None, title_justify="left", show_lines=True, highlight=False)
+    for name in texts:
+        table.add_column(Text(shown(name)), ratio=1, overflow="fold")
+    for name in figures:
+        table.add_column(Text(shown(name)), justify="right", no_wrap=True)
+    for line in lines:
+        table.add_row(*[Text(cell) for cell in line])  # Text: brackets in a response are not markup
+    console = console or Console(file=stream, width=width, markup=False, highlight=False)
+    console.print(table)
+
+
+def _finite(value: Any) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _writable(value: Any) -> Any:
+    """``value`` with characters that UTF-8 cannot hold (halves of a surrogate pair) written as escapes."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        return {_writable(key): _writable(item) for key, item in value.items()}
+    return [_writable(item) for item in value] if isinstance(value, list | tuple) else value

@@ -1,0 +1,229 @@
+"""One row of any format to tokens: strings and chats, what of them is learnt, the EOS that closes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+Messages = list[dict[str, Any]]
+Pieces = list[tuple[list[int], bool]]  # tokens, and whether they are learnt
+
+
+class Encoder:
+    """A tokenizer with its habits made explicit: what it puts before a text, and what closes one.
+
+    ``eos`` are the ids that end a response; the first is appended where a text does not end with one.
+    Prompt and reply are tokenised apart, at the place where sampling parts them.
+    """
+
+    def __init__(self, tokenizer: Any, eos: int | Sequence[int] = ()) -> None:
+        self.tokenizer = tokenizer
+        self.eos = (eos,) if isinstance(eos, int) else tuple(eos)
+        # A probe separates the opening (a BOS, or nothing) from a closing EOS, also where both are one id.
+        bare, whole = self.bare("a"), list(tokenizer("a")["input_ids"])
+        starts = (i for i in range(len(whole)) if bare and whole[i : i + len(bare)] == bare)
+        self.opening = whole[: next(starts, 0)]
+
+    def bare(self, text: str) -> list[int]:
+        """The tokens of a text and nothing else."""
+        return list(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"])
+
+    def text(self, text: str) -> list[int]:
+        """The tokens of a text with the tokenizer's opening, which is never put there twice."""
+        tokens = self.bare(text)
+        return tokens if tokens[: len(self.opening)] == self.opening else [*self.opening, *tokens]
+
+    def reply(self, prompt: str, completion: str) -> tuple[list[int], list[int]]:
+        """Prompt and completion of plain text: together, as the tokenizer writes them, where that leaves the
+        prompt as it is; apart where a token would reach across.
+        """
+        before, whole = self.text(prompt), self.text(prompt + completion)
+        apart = whole[: len(before)] != before
+        return before, self.bare(completion) if apart else whole[len(before) :]
+
+    def closing(self, tokens: list[int]) -> int | None:
+        """How many tokens there are up to the EOS that closes a reply, it included; None without such an EOS.
+
+        Only blanks may follow it: chat templates write a newline there, which is never sampled.
+        """
+        last = max((i for i, token in enumerate(tokens) if token in self.eos), default=None)
+        if last is None or self.tokenizer.decode(tokens[last + 1 :]).strip():
+            return None
+        return last + 1
+
+    def closed(self, tokens: list[int]) -> list[int]:
+        """The tokens up to their closing EOS, which is appended where there is none."""
+        end = self.closing(tokens)
+        return [*tokens, self.eos[0]] if end is None else tokens[:end]
+
+    def render(self, messages: Messages, place: str, **options: Any) -> str:
+        """The text that the chat template makes of messages. ValueError where it cannot."""
+        if getattr(self.tokenizer, "chat_template", None) is None:
+            raise ValueError(
+                f"{place} holds messages, and this tokenizer has no chat template. Give plain strings, or a "
+                "model that was made for chats."
+            )
+        try:
+            text = str(self.tokenizer.apply_chat_template(messages, tokenize=False, **options))
+        except Exception as error:  # whatever a template raises: it is a program of the model's authors
+            raise ValueError(f"{place}: the chat template refuses these messages ({error}).") from error
+        return encodable(text, f"the chat of {place}")
+
+    def chat(self, messages: Messages, place: str, *, first: int = 0, tools: Any = None) -> Pieces:
+        """A chat in pieces; assistant turns from message ``first`` on are learnt, up to their EOS."""
+        whole, at = self.render(messages, place, tools=tools), 0
+        pieces: Pieces = []
+        for index, message in enumerate(messages):
+            if message["role"] != "assistant" or index < first:
+                continue
+            start, end = self._turn(messages, index, whole, place, tools)
+            turn = self.bare(whole[start:end])
+            if index == len(messages) - 1:
+                turn = self.closed(turn)
+            cut = self.closing(turn) or len(turn)
+            pieces += [(self.bare(whole[at:start]), False), (turn[:cut], True), (turn[cut:], False)]
+            at = end
+        return [*pieces, (self.bare(whole[at:]), False)]
+
+    def _turn(self, messages: Messages, index: int, whole: str, place: str, tools: Any) -> tuple[int, int]:
+        """Where an assistant turn begins and ends in the chat's text: its header belongs to the prompt."""
+        if index == 0:
+            raise ValueError(
+                f"{place} begins with an assistant turn, which answers nothing. Put a user's message first."
+            )
+        before = self.render(messages[:index], place, tools=tools)
+        asked = self.render(messages[:index], place, tools=tools, add_generation_prompt=True)
+        until = self.render(messages[: index + 1], place, tools=tools)
+        if not whole.startswith(before) or not whole.startswith(until):
+            raise ValueError(
+                f"{place}: the chat template rewrites earlier turns when message {index} is followed by "
+                "others. Give one row a reply: the messages before it as prompt, the reply as completion."
+            )
+        return shared(whole, asked), len(until)
+
+    def prompt(self, messages: Messages, place: str, *, tools: Any = None) -> list[int]:
+        """A chat as far as the assistant's turn to speak, or to go on with a turn that it has begun."""
+        begun = messages[-1]["role"] == "assistant"
+        options = {"continue_final_message": True} if begun else {"add_generation_prompt": True}
+        return self.bare(self.render(messages, place, tools=tools, **options))
+
+
+def supervised(row: dict[str, Any], encoder: Encoder, place: str) -> Pieces:
+    """The pieces of a row for supervised fine-tuning."""
+    if has(row, "prompt", "completion"):
+        prompt, completion = content(row, "prompt", place), content(row, "completion", place)
+        if isinstance(prompt, str) and isinstance(completion, str):
+            return answered(encoder, prompt, completion)
+        asked = as_messages(prompt, "user")
+        messages = [*asked, *as_messages(completion, "assistant")]
+        return encoder.chat(messages, place, first=len(asked), tools=row.get("tools"))
+    if has(row, "messages"):
+        messages = as_messages(content(row, "messages", place), "user")
+        return encoder.chat(messages, place, tools=row.get("tools"))
+    if has(row, "text"):
+        text = content(row, "text", place)
+        if isinstance(text, str):
+            return [(encoder.closed(encoder.text(text)), True)]
+        raise ValueError(f"text of {place} is a list; expected a string. Chats belong into messages.")
+    raise missing(row, place, "text, prompt and completion, or messages")
+
+
+def preference(row: dict[str, Any], encoder: Encoder, place: str) -> list[Pieces]:
+    """The pieces of the chosen and of the rejected text of a row."""
+    if not has(row, "chosen", "rejected"):
+        raise missing(row, place, "chosen and rejected, and prompt unless both contain it")
+    prompt = content(row, "prompt", place) if has(row, "prompt") else None
+    replies = [content(row, column, place) for column in ("chosen", "rejected")]
+    texts = [reply for reply in replies if isinstance(reply, str)]
+    if len(texts) == 2 and not isinstance(prompt, list):
+        if prompt is None:
+            return [[(encoder.closed(encoder.text(text)), True)] for text in texts]
+        return [answered(encoder, prompt, text) for text in texts]
+    chosen, rejected = (_whole_chat(prompt, as_messages(reply, "assistant")) for reply in replies)
+    first = shared(chosen, rejected)
+    return [encoder.chat(chat, place, first=first, tools=row.get("tools")) for chat in (chosen, rejected)]
+
+
+def answered(encoder: Encoder, prompt: str, completion: str) -> Pieces:
+    """A prompt, not learnt, and a completion, learnt with its EOS."""
+    before, reply = encoder.reply(prompt, completion)
+    return [(before, False), (encoder.closed(reply), True)]
+
+
+def _whole_chat(prompt: str | Messages | None, reply: Messages) -> Messages:
+    """Prompt and reply; a reply that begins with the prompt's messages, or with a user, brings it along."""
+    if prompt is None or (isinstance(prompt, str) and reply[0]["role"] != "assistant"):
+        return reply
+    asked = as_messages(prompt, "user")
+    return reply if reply[: len(asked)] == asked else [*asked, *reply]
+
+
+def joined(pieces: Pieces, *, everything: bool = False) -> tuple[list[int], list[bool]]:
+    """Tokens and what of them is learnt; the first is no target, and what follows the last is left out."""
+    tokens = [token for piece, _ in pieces for token in piece]
+    learn = [learnt or everything for piece, learnt in pieces for _ in piece]
+    learn[:1] = [False] * len(learn[:1])
+    end = max((i + 1 for i, learnt in enumerate(learn) if learnt), default=0)
+    return tokens[:end], learn[:end]
+
+
+def shared(first: Sequence[Any], second: Sequence[Any]) -> int:
+    """The number of leading items that two sequences have in common."""
+    pairs = enumerate(zip(first, second, strict=False))
+    return next((i for i, (a, b) in pairs if a != b), min(len(first), len(second)))
+
+
+def has(row: dict[str, Any], *columns: str) -> bool:
+    """Whether a row has all of these columns; one that holds None is not there."""
+    return all(row.get(column) is not None for column in columns)
+
+
+def missing(row: dict[str, Any], place: str, expected: str) -> ValueError:
+    """The error for a row without its columns."""
+    seen = ", ".join(str(name) for name in row if row[name] is not None) or "none"
+    return ValueError(f"{place} has the columns: {seen}; expected {expected}. Rename them in the data.")
+
+
+def as_messages(value: str | Messages, role: str) -> Messages:
+    """Messages as they are, a string as the one message of ``role``."""
+    return [{"role": role, "content": value}] if isinstance(value, str) else value
+
+
+def content(row: dict[str, Any], column: str, place: str) -> str | Messages:
+    """A string of encodable text that is not blank, or a list of messages. ValueError names the row and what
+    is wrong.
+    """
+    value = row[column]
+    if not isinstance(value, str | list):
+        kind = type(value).__name__
+        raise ValueError(f"{column} of {place} is {kind}; expected a string or a list of messages.")
+    if not value or (column != "completion" and isinstance(value, str) and not value.strip()):
+        raise ValueError(f"{column} of {place} is empty. Take the row out, or fill it in.")
+    if isinstance(value, str):
+        return encodable(value, f"{column} of {place}")
+    for message in value:
+        if not isinstance(message, dict) or not isinstance(message.get("role"), str):
+            raise ValueError(
+                f"{column} of {place} holds {message!r}; expected messages like "
+                '{"role": "user", "content": "Hello"}.'
+            )
+        text, role = message.get("content"), message["role"]
+        blank = not text or (isinstance(text, str) and not text.strip())
+        if blank and role != "system" and not message.get("tool_calls"):
+            raise ValueError(
+                f"{column} of {place} has an empty {role} message. Take the row out, or fill it in."
+            )
+    return value
+
+
+def encodable(text: str, place: str) -> str:
+    """The text, where it is one: ValueError for half of a surrogate pair, which no tokenizer reads."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(
+            f"{place} holds {text[error.start]!r} at character {error.start}: half of a surrogate pair, "
+            "which is no text. It was cut or decoded wrongly: take the row out, or the character, with "
+            'text.encode("utf-8", "ignore").decode().'
+        ) from error
+    return text

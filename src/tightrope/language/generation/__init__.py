@@ -1,0 +1,1 @@
+"""Sampling and what a policy gives to tokens."""

@@ -1,0 +1,159 @@
+"""Responses from a causal language model: one prefill of each prompt, then a token a step from the KV cache.
+
+Each row's tokens come from uniform numbers of its own, drawn beforehand, so that a response does not depend
+on which rows are sampled beside it or have finished before it.
+"""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tightrope.language.data.batching import positions
+from tightrope.language.generation.distribution import Sampling, at_head, shape_logits
+from tightrope.language.model.parts import parts
+
+# A forward pass takes its cache under the old name up to transformers 5.23. From 5.24 on the name is new, and
+# the old one warns at every step. Models outside transformers may keep the old name.
+NEW, OLD = "cache", "past_key_values"
+LOG_RATIO_LIMIT = 1e-4  # float32; what is sampled is what is trained
+# nats, bfloat16: two passes differ by up to 0.54 in 86,000 tokens of SmolLM2; a wrong mask costs more
+LOWERED_LIMIT = 1.0
+
+
+def log_ratio_limit(dtype: str) -> float:
+    """The largest gap of two passes over one token that is rounding, in nats."""
+    return LOG_RATIO_LIMIT if dtype == "float32" else LOWERED_LIMIT
+
+
+@dataclass(frozen=True)
+class Responses:
+    """B responses of at most R tokens: ``tokens`` and ``logp`` [B, R], ``mask`` [B, R] True for real tokens.
+
+    ``ended`` [B]: the response closed itself with an EOS (which counts as a token of it). ``support``
+    [B, R, k]: the ids among which top-k drew, k at most the vocabulary; None without top-k.
+    """
+
+    tokens: Tensor
+    mask: Tensor
+    logp: Tensor
+    ended: Tensor
+    support: Tensor | None
+
+
+@dataclass
+class Completions:
+    """Responses to prompts. ``tokens``, ``real``: prompt and response, [B, P + R]; ``seconds``: to sample.
+
+    ``lower``: what enters the trunk's upper part, [B, P + R, d], where that was computed.
+    """
+
+    tokens: Tensor
+    real: Tensor
+    responses: Responses
+    seconds: float
+    lower: Tensor | None
+
+    def ids(self) -> list[list[int]]:
+        """The token ids of each response, padding left out."""
+        pairs = zip(self.responses.tokens, self.responses.mask, strict=True)
+        return [tokens[mask].tolist() for tokens, mask in pairs]
+
+
+@torch.no_grad()
+def sample(
+    model: Any,
+    prompts: Tensor,
+    real: Tensor,
+    sampling: Sampling,
+    uniforms: Tensor,
+    eos: tuple[int, ...],
+    *,
+    samples_per_prompt: int = 1,
+) -> Responses:
+    """Sample a response to every prompt [N, P] (left-padded, ``real`` its mask), ``samples_per_prompt`` each.
+
+    ``uniforms`` [N * samples_per_prompt, R] in [0, 1) decide every token; R is the longest a response gets.
+    Rows of one prompt are neighbours. Rows that met an EOS leave the batch. Log-probabilities are those of
+    the distribution that was sampled: after temperature and top-k.
+    """
+    base, _, head = parts(model)
+    rows, columns = uniforms.shape
+    device = prompts.device
+    tokens = torch.zeros(rows, columns, dtype=torch.int64, device=device)
+    mask = torch.zeros(rows, columns, dtype=torch.bool, device=device)
+    logp = torch.zeros(rows, columns, device=device)
+    shape = (rows, columns, min(sampling.top_k, len(head.weight)))  # as many as `draw` has to choose among
+    support = torch.zeros(shape, dtype=torch.int64, device=device) if sampling.top_k else None
+    ended = torch.zeros(rows, dtype=torch.bool, device=device)
+    stops = torch.tensor(eos, device=device)
+
+    step = cached_forward(base, prompts, real.long(), positions(real))
+    cache, hidden = step.cache, step.hidden[:, -1]
+    alive, seen = torch.arange(rows, device=device), real.repeat_interleave(samples_per_prompt, 0)
+    if samples_per_prompt > 1:
+        cache.batch_repeat_interleave(samples_per_prompt)
+        hidden = hidden.repeat_interleave(samples_per_prompt, 0)
+    place_of_next = seen.sum(1)
+    for t in range(columns):
+        chosen, own_logp, allowed = draw(hidden, head, sampling, uniforms[alive, t])
+        tokens[alive, t], logp[alive, t], mask[alive, t] = chosen, own_logp, True
+        if support is not None and allowed is not None:
+            support[alive, t] = allowed
+        going = ~torch.isin(chosen, stops)
+        ended[alive[~going]] = True
+        if t + 1 == columns or not bool(going.any()):
+            break
+        if not bool(going.all()):
+            kept = going.nonzero()[:, 0]
+            cache.batch_select_indices(kept)
+            alive, seen, chosen, place_of_next = alive[kept], seen[kept], chosen[kept], place_of_next[kept]
+        seen = torch.cat([seen, seen.new_ones(len(seen), 1)], 1)
+        step = cached_forward(base, chosen[:, None], seen.long(), place_of_next[:, None], cache)
+        cache, hidden, place_of_next = step.cache, step.hidden[:, -1], place_of_next + 1
+    return Responses(tokens, mask, logp, ended, support)
+
+
+def draw(
+    hidden: Tensor, head: nn.Linear, sampling: Sampling, uniforms: Tensor
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """One token a row from hidden states [N, d]: ids, log-probabilities [N], and with top-k its support."""
+    logits = shape_logits(nn.functional.linear(hidden, head.weight, head.bias), at_head(sampling, head))
+    support = None
+    if sampling.top_k:
+        logits, support = logits.topk(min(sampling.top_k, logits.shape[1]), dim=1)
+    logs = logits.log_softmax(1)
+    steps = logs.double().exp().cumsum(1)
+    # the last step may round to less than 1, and what follows the last possible token must not be reached
+    index = torch.searchsorted(steps, uniforms.double()[:, None] * steps[:, -1:], right=True)
+    last = (logs > -torch.inf).int().cumsum(1).argmax(1, keepdim=True)
+    index = torch.minimum(index, last)
+    own = logs.gather(1, index)[:, 0]
+    chosen = index[:, 0] if support is None else support.gather(1, index)[:, 0]
+    return chosen, own, support
+
+
+class Step(NamedTuple):
+    """One forward pass: ``hidden`` [B, T, d], the last hidden states, and the cache after it."""
+
+    hidden: Tensor
+    cache: Any
+
+
+def cached_forward(
+    base: nn.Module, tokens: Tensor, attention_mask: Tensor, positions: Tensor, cache: Any = None
+) -> Step:
+    """Run ``base`` on ``tokens`` [B, T] with a cache. None starts a new one; a given one grows in place.
+
+    ``attention_mask`` [B, T + cached]: 1 for real tokens. ``positions`` [B, T].
+    """
+    name = NEW if NEW in inspect.signature(base.forward).parameters else OLD
+    given = {} if cache is None else {name: cache}
+    out = base(tokens, attention_mask=attention_mask, position_ids=positions, use_cache=True, **given)
+    # asked for by name in this order: reading the old name from a new output warns
+    after = out.cache if hasattr(out, NEW) else out.past_key_values
+    return Step(out.last_hidden_state, after)

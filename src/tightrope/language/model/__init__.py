@@ -1,0 +1,1 @@
+"""Loading and taking apart causal language models."""

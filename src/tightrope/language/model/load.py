@@ -1,0 +1,221 @@
+"""Loading models, tokenizers and the files of model folders. Nothing in a folder is run.
+
+transformers would run code that a configuration names (``auto_map``) when allowed to, unpickle
+``pytorch_model.bin`` when there is no safetensors file, and hand an ``adapter_config.json`` to PEFT, which
+imports modules by the names it finds there. Here all three are refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tightrope.language.model.parts import parts
+from tightrope.runs.records import each_key_once
+
+# every file of a model folder in which transformers looks for the names of code
+CONFIGS = ("config.json", "generation_config.json", "tokenizer_config.json", "processor_config.json")
+UNPICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
+
+
+def require_device(device: str) -> None:
+    """ValueError unless torch can put a tensor on this device of this machine; before a model is loaded."""
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, RuntimeError) as error:  # each backend has its own
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(
+            f"device is {device!r}, which cannot be used here ({reason}). Choose cpu."
+        ) from error
+
+
+def fingerprint(folder: str) -> str | None:
+    """A hash that differs between weights: of the size and of 64 samples, 4 kB each, of every weight file
+    in a model folder; None where there is none.
+    """
+    files = sorted(Path(folder).glob("*.safetensors"))
+    digest, block = hashlib.sha256(), 4096
+    for path in files:
+        size = path.stat().st_size
+        digest.update(f"{path.name} {size} ".encode())
+        with open(path, "rb") as file:
+            for number in range(64):
+                file.seek(number * max(0, size - block) // 63)
+                digest.update(file.read(block))
+    return digest.hexdigest() if files else None
+
+
+def load_tokenizer(folder: str) -> Any:
+    """The tokenizer; whatever it believes of padding is not used."""
+    from transformers import AutoTokenizer
+
+    return pretrained(AutoTokenizer, folder)
+
+
+def load_causal(folder: str, dtype: torch.dtype = torch.float32) -> Any:
+    """The model, ready to sample and to train: dropout is 0 in every module, so that both see one policy.
+
+    Raises ValueError for a model that `parts` refuses.
+    """
+    from transformers import AutoModelForCausalLM
+
+    model = fused(pretrained, AutoModelForCausalLM, folder, dtype=dtype)
+    without_dropout(model)
+    parts(model.eval())
+    return model
+
+
+def fused(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """A model of `pretrained` or `without_weights`, with fused attention where its architecture has it. What
+    its configuration chooses for attention is ignored: it may name a kernel to download.
+    """
+    try:
+        return make(*arguments, **options, attn_implementation="sdpa")
+    except ValueError as error:
+        if "scaled_dot_product_attention" not in str(error):
+            raise
+        return make(*arguments, **options, attn_implementation="eager")
+
+
+def without_dropout(model: nn.Module) -> None:
+    """Set every dropout probability to 0, also those that attention reads as a plain number."""
+    for module in model.modules():
+        if isinstance(module, nn.Dropout):
+            module.p = 0.0
+        for name, value in list(vars(module).items()):
+            if isinstance(value, float) and ("dropout" in name or "pdrop" in name):
+                setattr(module, name, 0.0)
+
+
+def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
+    """Every token that ends a response: those the model's generation settings name, else the tokenizer's.
+
+    The tokenizer's own comes first: it is the one that training data is closed with.
+    """
+    for source in (getattr(model, "generation_config", None), model.config, tokenizer):
+        found = getattr(source, "eos_token_id", None)
+        if found is not None:
+            own = getattr(tokenizer, "eos_token_id", None)
+            every = found if isinstance(found, list | tuple) else [found]
+            return tuple(sorted({int(token) for token in every}, key=lambda token: (token != own, token)))
+    raise ValueError(
+        "The model names no EOS token, so that no response could end. Set eos_token_id in its config."
+    )
+
+
+def pretrained(kind: Any, folder: str | Path, **options: Any) -> Any:
+    """``kind.from_pretrained(folder)`` for any of transformers' Auto classes: a folder or a hub id.
+
+    Code of the folder is never run: trust_remote_code is off, and whoever names some is refused. ValueError
+    for whatever cannot be loaded, with the reason.
+    """
+    import torch
+
+    refuse_code(folder)
+    if kind.__name__.startswith("AutoModel") and "gguf_file" not in options:
+        options["use_safetensors"] = True  # the other format is pickle
+    try:
+        return kind.from_pretrained(str(folder), trust_remote_code=False, **options)
+    except (MemoryError, torch.OutOfMemoryError):
+        raise
+    except Exception as error:  # whatever transformers, tokenizers and safetensors raise
+        pickled = [name for name in UNPICKLED if (Path(folder) / name).exists()]
+        advice = "Is it whole, and of an architecture that transformers knows?"
+        if pickled and not any(Path(folder).glob("*.safetensors")):
+            advice = (
+                f"It holds {pickled[0]}, a pickle, which is never read. Convert it where you trust it: "
+                "model.save_pretrained(FOLDER) of a recent transformers writes safetensors."
+            )
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise ValueError(
+            f"{folder} cannot be loaded by {kind.__name__} ({type(error).__name__}: {reason}). {advice}"
+        ) from error
+
+
+def without_weights(kind: Any, config: Any, **options: Any) -> Any:
+    """``kind.from_config(config)`` for any of transformers' Auto classes; no code of a folder is run."""
+    return kind.from_config(config, trust_remote_code=False, **options)
+
+
+def refuse_code(folder: str | Path) -> None:
+    """ValueError for a model that names code: in ``auto_map``, or by an adapter beside it.
+
+    Of a hub id only the adapter is looked for; its ``auto_map`` is refused by transformers, where it has no
+    code of its own for the architecture.
+    """
+    path = Path(folder)
+    for name in CONFIGS:
+        if (path / name).exists() and _names_code(read_object(path / name)):
+            raise ValueError(
+                f"{path / name} names code that lies beside the model (auto_map), which is never run. "
+                "Where transformers knows the architecture itself, take auto_map out of the file; else "
+                "choose another model."
+            )
+    if path.is_dir():
+        adapter = (path / "adapter_config.json").exists()
+    else:
+        from transformers.utils import find_adapter_config_file
+
+        try:
+            adapter = find_adapter_config_file(str(folder)) is not None
+        except OSError:  # no connection, or no such model: loading will say
+            adapter = False
+    if adapter:
+        raise ValueError(
+            f"{folder} holds a PEFT adapter (adapter_config.json), which may name modules to import, and is "
+            "never put on by itself. Fold it into its model with PEFT's merge_and_unload, save that, and "
+            "give its folder."
+        )
+
+
+def _names_code(value: Any) -> bool:
+    """Whether ``auto_map`` occurs anywhere in a configuration: the parts of a composite model have their
+    own.
+    """
+    if isinstance(value, dict):
+        return "auto_map" in value or any(map(_names_code, value.values()))
+    return isinstance(value, list) and any(map(_names_code, value))
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object in a JSON file as other programs write them: NaN and Infinity are let pass, a key that
+    occurs twice is not (readers differ in which one counts). ValueError names the file.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise ValueError("it is no regular file")
+        value = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=each_key_once)
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not readable as JSON ({error}).") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} holds {type(value).__name__}, expected an object.")
+    return value
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors of a safetensors file, on the CPU. ValueError names the file."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"{path} is not readable as safetensors ({error}).") from error
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """The texts in the header of a safetensors file. ValueError names the file."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            return dict(file.metadata() or {})
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"{path} is not readable as safetensors ({error}).") from error

@@ -1,0 +1,1 @@
+"""The roles on one trunk."""

@@ -1,0 +1,87 @@
+"""The policy and its critic as ppo.update sees them: a batch of responses -> figures of every token."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from tightrope.algorithms.batch import Batch
+from tightrope.language.data.batching import length_groups, used_columns
+from tightrope.language.generation.distribution import token_statistics
+from tightrope.language.policy.roles import Roles
+from tightrope.language.policy.rollout import FirstPass, Inputs
+
+
+class PolicyModel:
+    """What ppo.update trains: Batch -> FirstPass, each [B, R]; padding is cut off before the forward pass.
+
+    ``exact``: also the exact KL to the reference of every state. ``critic_only``: no gradient reaches the
+    policy. ``first_pass``: the rollout's own pass with its graph, used for the first call instead of a
+    forward pass.
+    """
+
+    def __init__(
+        self,
+        roles: Roles,
+        *,
+        exact: bool = False,
+        critic_only: bool = False,
+        first_pass: FirstPass | None = None,
+    ) -> None:
+        self.roles, self.exact, self.critic_only, self.first_pass = roles, exact, critic_only, first_pass
+
+    def __call__(self, part: Batch) -> FirstPass:
+        """Log-probabilities, entropies and KL of the policy, and the critic's values, where the mask is
+        True.
+        """
+        known, self.first_pass = self.first_pass, None  # a second call after memory ran out must not reuse it
+        if known is not None:
+            return FirstPass(**{name: x[part.inputs["row"]] for name, x in vars(known).items()})
+        groups = length_groups(part.inputs["real"], part.mask)
+        if len(groups) == 1:
+            return self._pass(part)
+        back = torch.cat(groups).argsort()
+        passes = [self._pass(part.select(rows)) for rows in groups]
+        names = ("logp", "entropy", "kl", "values")
+        return FirstPass(**{name: torch.cat([getattr(x, name) for x in passes])[back] for name in names})
+
+    def named_parameters(self) -> Iterator[tuple[str, Tensor]]:
+        """Everything that may be trained, by name: for messages."""
+        return self.roles.named_parameters()
+
+    def _pass(self, part: Batch) -> FirstPass:
+        """One forward pass over some rows."""
+        roles, mask, inputs = self.roles, part.mask, Inputs(**part.inputs)
+        columns, length = mask.shape[1], inputs.tokens.shape[1]
+        left, right = used_columns(inputs.real, mask)
+        tokens, real = inputs.tokens[:, left:right], inputs.real[:, left:right]
+        lower = None if inputs.lower is None else inputs.lower[:, left:right]
+        first = length - columns - left - 1  # the state in which the first response token is chosen
+        used = mask[:, : right + 1 - length + columns]
+
+        def steps(hidden: Tensor) -> Tensor:
+            return hidden[:, first : first + used.shape[1]][used]
+
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.critic_only):
+            hidden = roles.policy.hidden(tokens, real, lower)
+        reference = inputs.ref_hidden if self.exact else None
+        found = token_statistics(
+            steps(hidden), roles.trunk.parts.head, part.actions[mask], roles.sampling,
+            support=None if inputs.support is None else inputs.support[mask],
+            reference=None if reference is None else reference[mask],
+            reference_head=roles.reference.trunk.parts.head,
+            ahead=roles.settings.logp_alone,
+        )  # fmt: skip
+        values = found.logp.new_zeros(len(found.logp))
+        if roles.critic_head is not None:
+            critic = hidden if roles.critic is None else roles.critic.hidden(tokens, real, lower)
+            values = roles.critic_head(steps(critic).float())[:, 0]
+        zeros = torch.zeros(mask.shape, device=mask.device)
+        return FirstPass(
+            logp=zeros.masked_scatter(mask, found.logp),
+            entropy=zeros.masked_scatter(mask, found.entropy),
+            values=zeros.masked_scatter(mask, values),
+            kl=zeros.masked_scatter(mask, found.kl),
+        )

@@ -1,0 +1,185 @@
+"""Policy, reference, critic and reward model: four roles, one trunk in memory where that is possible.
+
+policy     adapter "policy", the language-model head          (tune full: every weight)
+reference  the bare trunk, the same head                      (tune full: a frozen copy)
+critic     a head on the policy's hidden states | adapter "critic" and a head | a separate model
+reward     adapter "reward" and a head | a separate model | a function of the text
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from tightrope.language.generation.distribution import Sampling
+from tightrope.language.memory import available_memory, check, job_of, ledger, reward_model_bytes
+from tightrope.language.model import lora
+from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, require_device
+from tightrope.language.model.packaged import find_model
+from tightrope.language.model.parts import parameter_counts, parts
+from tightrope.language.model.saving import load_adapter
+from tightrope.language.model.trunk import Role, Trunk
+from tightrope.language.settings import AlignSettings
+
+
+@dataclass
+class Roles:
+    """The models of an alignment run, most of them on the policy's trunk.
+
+    ``critic``: None where its head reads the policy's hidden states, or where there is no critic.
+    """
+
+    tokenizer: Any
+    policy: Role
+    reference: Role
+    critic: Role | None
+    critic_head: nn.Linear | None
+    settings: AlignSettings
+    sampling: Sampling
+    eos: tuple[int, ...]
+
+    @property
+    def trunk(self) -> Trunk:
+        """The policy's trunk."""
+        return self.policy.trunk
+
+    @property
+    def model(self) -> Any:
+        """The policy's model."""
+        return self.policy.trunk.model
+
+    def frozen_policy(self) -> contextlib.AbstractContextManager[None]:
+        """Inside, the model is the policy as it is now, its adapter folded in; without gradients."""
+        return lora.folded(self.model, self.policy.adapter)
+
+    def critic_parameters(self) -> list[nn.Parameter]:
+        """What only the critic trains."""
+        found = [] if self.critic_head is None else list(self.critic_head.parameters())
+        if self.critic is not None and self.critic.adapter is None:
+            found += list(self.critic.trunk.parts.base.parameters())
+        elif self.settings.critic == "adapter":
+            found += lora.adapter_parameters(self.model, "critic")
+        return found
+
+    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """Every weight of the policy's model and of the critic, by name."""
+        yield from self.model.named_parameters()
+        if self.critic_head is not None:
+            yield from self.critic_head.named_parameters("critic_head")
+        if self.critic is not None and self.critic.adapter is None:
+            yield from self.critic.trunk.parts.base.named_parameters("critic")
+
+    def lines(self) -> list[str]:
+        """What is trained, in lines to show where a run begins."""
+        settings, trunk = self.settings, self.trunk
+        trained, total = parameter_counts(self.model, self.parameters())
+        shared = (
+            f"; {trunk.cut} of {len(trunk.parts.layers)} layers computed once for all roles"
+            if trunk.cut
+            else ""
+        )
+        return [
+            f"policy: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained{shared}",
+            f"critic: {settings.critic}; KL: {settings.kl}, kl_beta {settings.kl_beta:g}",
+        ]
+
+    def parameters(self) -> list[nn.Parameter]:
+        """Everything that is trained: the policy's weights or adapter, then the critic's."""
+        if self.policy.adapter is None:
+            return list(self.model.parameters()) + self.critic_parameters()
+        return lora.adapter_parameters(self.model, self.policy.adapter) + self.critic_parameters()
+
+
+def make_roles(
+    settings: AlignSettings,
+    reward_adapter: Path | None = None,
+    notify: Callable[[str], None] = print,
+    *,
+    own_reward: bool = False,
+) -> Roles:
+    """Load and arrange the models. ``reward_adapter``: a reward model's adapter for this very trunk;
+    ``own_reward``: the reward is a model with a trunk of its own, which will stand beside them.
+
+    The memory ledger is handed to ``notify`` before anything large is loaded; what cannot fit is a
+    ValueError.
+    """
+    require_device(settings.device)
+    folder, dtype, device = find_model(settings.model), getattr(torch, settings.dtype), settings.device
+    beside = judges_of(settings, own_reward)
+    guessed = own_reward and not Path(settings.reward or "-").is_dir()
+    kind = "separate" if guessed else "none" if reward_adapter is None else "adapter"
+    present_memory(folder, settings, kind, notify, beside)
+    tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
+    stops, cut = eos_ids(model, tokenizer), 0
+    if settings.tune == "lora":
+        layers = lora.top_layers(model, settings.lora_layers)
+        cut = layers[0]
+        for number, name in enumerate(["policy"] + ["critic"] * (settings.critic == "adapter")):
+            seed = settings.seed * 10 + number
+            lora.add_adapter(model, name, settings.lora_rank, settings.lora_alpha, layers, seed)
+        if reward_adapter is not None:
+            load_adapter(model, "reward", reward_adapter)
+            cut = min(cut, lowest_layer(model, "reward"))
+    checkpointing = settings.gradient_checkpointing
+    trunk = Trunk(model, cut, checkpointing=checkpointing)
+    policy, reference = Role(trunk, "policy"), Role(trunk)
+    if settings.tune == "full":
+        copy = load_causal(folder, dtype).to(device).requires_grad_(False)
+        policy, reference = Role(trunk), Role(Trunk(copy))
+    critic = None
+    if settings.critic == "adapter":
+        critic = Role(trunk, "critic")
+    elif settings.critic == "separate":
+        critic = Role(Trunk(load_causal(folder, dtype).to(device), checkpointing=checkpointing))
+    head = None
+    if settings.critic != "none":
+        head = nn.Linear(model.config.hidden_size, 1).to(device)
+        nn.init.zeros_(head.weight)  # the first values are 0, whatever the hidden states
+        nn.init.zeros_(head.bias)
+    sampling = Sampling(settings.temperature, settings.top_k, stops if settings.ignore_eos else ())
+    return Roles(tokenizer, policy, reference, critic, head, settings, sampling, stops)
+
+
+def judges_of(settings: AlignSettings, own_reward: bool) -> list[Path]:
+    """The folders of reward models that the settings name and that have a trunk of their own: the reward
+    with ``own_reward``, the gold judge always.
+    """
+    named = [settings.reward if own_reward else None, settings.gold]
+    return [Path(name) for name in named if name and Path(name).is_dir()]
+
+
+def present_memory(
+    folder: str,
+    settings: AlignSettings,
+    reward: str,
+    notify: Callable[[str], None],
+    judges: Sequence[Path] = (),
+) -> None:
+    """Say what the job will take, and refuse it with advice when it cannot fit: before weights are loaded.
+
+    ``judges``: folders of reward models with a trunk of their own, each of any size.
+    """
+    from transformers import AutoConfig
+
+    rows = min(settings.update.micro_batch_size or settings.update.minibatch_size, settings.batch_size)
+    texts = rows * settings.ptx_per_response if settings.ptx_weight else 0
+    extra = texts * (settings.max_prompt_tokens + settings.max_new_tokens)
+    sizes = tuple((judge.resolve().name, reward_model_bytes(judge)) for judge in judges)
+    job = job_of(settings, reward=reward, extra_tokens=extra, judges=sizes)
+    found = ledger(pretrained(AutoConfig, folder), job)
+    notify(found.text())
+    check(found, available_memory(settings.device))
+
+
+def lowest_layer(model: Any, name: str) -> int:
+    """The index of the lowest decoder layer that an adapter changes."""
+    for index, layer in enumerate(parts(model).layers):
+        if name in lora.adapter_names(layer):
+            return index
+    raise ValueError(f"The model has no adapter {name!r}.")

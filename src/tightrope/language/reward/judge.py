@@ -1,0 +1,257 @@
+"""Who judges responses: a reward model on the policy's own trunk, one with a trunk of its own, or
+functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tightrope.algorithms.memory import OutOfMemory, is_out_of_memory
+from tightrope.language.data.examples import Prompt
+from tightrope.language.generation.sample import Completions
+from tightrope.language.model import lora
+from tightrope.language.model.load import fingerprint, read_metadata, read_tensors
+from tightrope.language.model.trunk import Role
+from tightrope.language.policy.roles import Roles
+from tightrope.language.reward.call import Fault, RewardError
+from tightrope.language.reward.functions import (
+    Rewards,
+    Scores,
+    checked_weight,
+    load_reward_function,
+    unique_name,
+)
+from tightrope.language.reward.model import RewardModel, last_real, load_reward
+
+
+class Judge:
+    """Scores of whole responses, from functions of the text and from a reward model, weighted and added up.
+
+    ``adapter``: a reward adapter on the policy's trunk with its head [1, d] and shift; ``model``: one with a
+    trunk of its own, which must know the policy's tokens; ``weight``: of either.
+    """
+
+    def __init__(
+        self,
+        roles: Roles,
+        functions: Rewards | None = None,
+        model: RewardModel | None = None,
+        adapter: tuple[Tensor, float] | None = None,
+        weight: float = 1.0,
+    ) -> None:
+        self.roles, self.functions, self.model, self.adapter = roles, functions, model, adapter
+        self.weight = weight
+
+    def __call__(self, prompts: Sequence[Prompt], answers: Completions, trainer_state: Any = None) -> Scores:
+        """Scores of the responses to ``prompts``, one prompt a response."""
+        found = self._of_functions(prompts, answers, trainer_state)
+        try:
+            learnt = self._of_model(answers)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            raise OutOfMemory(
+                f"Memory is not enough for the reward model to score {len(answers.tokens)} responses. "
+                "Choose a smaller --micro-batch-size or --batch-size."
+            ) from error
+        if learnt is not None:
+            return with_model(found, learnt, self.weight)
+        assert found is not None
+        return found
+
+    def _of_functions(self, prompts: Sequence[Prompt], answers: Completions, state: Any) -> Scores | None:
+        if self.functions is None:
+            return None
+        ids = answers.ids()
+        texts = [self.roles.tokenizer.decode(row, skip_special_tokens=True) for row in ids]
+        completions = [
+            text if isinstance(prompt.shown, str) else [{"role": "assistant", "content": text}]
+            for prompt, text in zip(prompts, texts, strict=True)
+        ]
+        names = {name for prompt in prompts for name in prompt.columns}
+        columns = {name: [prompt.columns.get(name) for prompt in prompts] for name in sorted(names)}
+        return self.functions.score([p.shown for p in prompts], completions, ids, columns, state)
+
+    @torch.no_grad()
+    def _of_model(self, answers: Completions) -> np.ndarray | None:
+        if self.model is None and self.adapter is None:
+            return None
+        size = self.roles.settings.update.micro_batch_size or len(answers.tokens)
+        scores = []
+        for start in range(0, len(answers.tokens), size):
+            rows = slice(start, start + size)
+            tokens, real = answers.tokens[rows], answers.real[rows]
+            if self.model is not None:
+                scores.append(self.model.score(tokens, real).float())
+                continue
+            assert self.adapter is not None
+            head, shift = self.adapter
+            lower = None if answers.lower is None else answers.lower[rows]
+            hidden = Role(self.roles.trunk, "reward").hidden(tokens, real, lower)
+            scores.append((last_real(hidden, real).float() @ head.float().T)[:, 0] - shift)
+        return torch.cat(scores).double().cpu().numpy()
+
+
+def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) -> Scores:
+    """The functions' scores and a reward model's, [B], added up.
+
+    Where no function applies only the model's score counts. A score of the model that is not finite masks its
+    response. RewardError when none is finite: the model is broken.
+    """
+    good = np.isfinite(learnt)
+    if not good.any():
+        raise RewardError(
+            f"The reward model gave {learnt[0]} for sample 0 of {len(learnt)} and no finite score for any "
+            "other: its weights are not usable. Train it again, or give another."
+        )
+    if found is None:
+        found = Scores(np.zeros(len(learnt)), np.ones(len(learnt), bool), {}, {}, {})
+    model_only = np.zeros(len(learnt), bool)
+    model_only[[sample for fault in found.faults if fault.kind == "none" for sample in fault.samples]] = True
+    valid = (found.valid | model_only) & good
+    part, name = np.where(good, learnt, np.nan), unique_name(found.parts, "reward_model")
+    faults = [fault for fault in found.faults if fault.kind != "none"]
+    if not good.all():
+        bad = tuple(np.flatnonzero(~good).tolist())
+        where = f"sample {bad[0]} of {len(learnt)}" + (f" and {len(bad) - 1} more" if len(bad) > 1 else "")
+        text = f"The reward model gave {learnt[bad[0]]} for {where}, expected a finite number."
+        faults.append(Fault(name, "not finite", bad, text))
+    return Scores(
+        total=np.where(valid, np.where(model_only, 0.0, found.total) + weight * part, np.nan),
+        valid=valid,
+        parts={**found.parts, name: part},
+        metrics={**found.metrics, f"scores/{name}": float(part[good].mean())},
+        extras=found.extras,
+        faults=faults,
+    )
+
+
+def is_folder(reward: Any) -> bool:
+    """Whether a reward, or one of several, is the folder of a reward model."""
+    entries = (_weighted(entry)[0] for entry in _entries(reward))
+    return any(isinstance(entry, str | Path) and Path(entry).is_dir() for entry in entries)
+
+
+def reward_adapter(words: Any) -> Path | None:
+    """The adapter folder of a reward model that was trained with LoRA, None for any other reward."""
+    for entry, _ in map(_weighted, _entries(words)):
+        if isinstance(entry, str | Path) and (Path(entry) / "adapter" / "head.safetensors").is_file():
+            return Path(entry) / "adapter"
+    return None
+
+
+def shares_trunk(adapter: Path, model: str) -> bool:
+    """Whether a reward adapter was trained on the very weights that are aligned, wherever they lie."""
+    trained = read_metadata(adapter / "head.safetensors").get("trunk")
+    return bool(trained) and trained == fingerprint(model)
+
+
+def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: float | None) -> Judge:
+    """A judge from what the user gave: a function, (function, weight), words of the command line, or several.
+
+    ``on_trunk``: the folder of the adapter that `make_roles` has put on the trunk.
+    """
+    functions: list[Any] = []
+    model, adapter, model_weight = None, None, 1.0
+    if isinstance(reward, str) and not reward:
+        raise ValueError(
+            "There is no reward. Give a function, 'length', FILE.py:function or the folder of a reward model."
+        )
+    for entry, weight in map(_weighted, _entries(reward)):
+        if is_folder(entry):
+            if model is not None or adapter is not None:
+                raise ValueError("Two reward models were given; expected one, and any number of functions.")
+            model_weight = weight
+            if on_trunk is not None and reward_adapter(entry) == on_trunk:
+                adapter = read_head(on_trunk, roles)
+            else:
+                model = load_reward(Path(entry)).to(roles.settings.device)
+                _same_tokens(model, roles, entry)
+        elif isinstance(entry, str):
+            functions.append((load_reward_function(entry), weight))
+        elif callable(entry):
+            functions.append((entry, weight))
+        else:
+            raise ValueError(
+                f"reward is {entry!r}; expected a function, 'length', FILE.py:function, the folder of a "
+                "reward model, one of these with its weight in a pair, or a list of them."
+            )
+    alone = model is None and adapter is None
+    rewards = Rewards(functions, timeout=timeout, alone=alone) if functions else None
+    return Judge(roles, rewards, model, adapter, model_weight)
+
+
+def _weighted(entry: Any) -> tuple[Any, float]:
+    """A reward and its weight, 1 where none is given. ValueError for a weight that is no finite number."""
+    if isinstance(entry, tuple) and len(entry) == 2:
+        return entry[0], checked_weight(entry[1])
+    return entry, 1.0
+
+
+def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:
+    """The score head [1, d] and the shift that lie beside a reward adapter."""
+    tensors = read_tensors(adapter / "head.safetensors")
+    width = roles.model.config.hidden_size
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    if shapes != {"score.weight": (1, width), "shift": ()}:
+        raise ValueError(
+            f"{adapter / 'head.safetensors'} holds {shapes}, expected score.weight (1, {width}) and a shift. "
+            "Train the reward model again: tightrope reward."
+        )
+    head = tensors["score.weight"].to(next(roles.model.parameters()).device)
+    return head, float(tensors["shift"])
+
+
+def _same_tokens(model: RewardModel, roles: Roles, folder: Any) -> None:
+    theirs, ours = model.tokenizer.get_vocab(), roles.tokenizer.get_vocab()
+    if theirs != ours:
+        raise ValueError(
+            f"The reward model {folder} reads {len(theirs)} tokens, the policy writes {len(ours)} others. "
+            "Wrap it in a reward function of the text, or train it from the policy's own model."
+        )
+
+
+def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
+    """Begin the critic with a reward model's weights: V = what its score adds to the reward at first.
+
+    An adapter takes the reward model's adapter, a critic of its own the whole reward model; a head on the
+    policy's hidden states cannot read what the reward model's hidden states say. ValueError for what does not
+    fit.
+    """
+    folder = next((_weighted(entry)[0] for entry in _entries(reward) if is_folder(entry)), None)
+    kind, head = roles.settings.critic, roles.critic_head
+    if folder is None or head is None or kind == "head" or (kind == "adapter" and judge.adapter is None):
+        raise ValueError(
+            f"critic_from_reward with critic {kind!r}: expected the folder of a reward model as reward and "
+            "critic separate, or critic adapter with a reward adapter on the very model that is aligned "
+            "(tightrope reward --tune lora). Choose one, or leave critic_from_reward out."
+        )
+    if kind == "adapter" and judge.adapter is not None:
+        weight, shift = judge.adapter
+        state = lora.adapter_state(roles.model, "reward")
+        lora.load_adapter_state(roles.model, "critic", state)
+    else:
+        assert roles.critic is not None
+        model = judge.model or load_reward(folder)
+        weight, shift = model.head.weight, model.shift
+        try:
+            roles.critic.trunk.parts.base.load_state_dict(model.base.state_dict())
+        except RuntimeError as error:
+            raise ValueError(
+                f"critic_from_reward: the reward model {folder} is built otherwise than the critic, which is "
+                f"made of {roles.settings.model} ({str(error).splitlines()[-1].strip()}). Leave it out."
+            ) from error
+    scale = judge.weight * roles.settings.reward_scale
+    with torch.no_grad():
+        head.weight.copy_(weight * scale)
+        head.bias.fill_(-shift * scale)
+
+
+def _entries(reward: Any) -> list[Any]:
+    return list(reward) if isinstance(reward, list) else [reward]

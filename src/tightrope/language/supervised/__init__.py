@@ -1,0 +1,1 @@
+"""The first two stages: SFT and reward models."""

@@ -1,0 +1,261 @@
+"""What supervised fine-tuning and reward modelling share: the state of a run, and one optimiser step.
+
+minibatch -> micro-batches, whose gradients add up -> Adam; held-out examples after every epoch
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tightrope.algorithms.memory import Parts
+from tightrope.algorithms.nonfinite import explain_loss
+from tightrope.algorithms.optimise import Adam, Meter, StepGuard
+from tightrope.language.data.examples import Item
+from tightrope.language.settings import SupervisedSettings
+from tightrope.runs.checkpoint import understood
+from tightrope.runs.history import Checkpoint
+from tightrope.runs.run import Run
+from tightrope.settings.fields import scheduled
+from tightrope.training.learner import Update, crosses
+from tightrope.training.parameters import Tensors, put_back, tensors_of
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What is learnt from ``items``.
+
+    ``loss(items)`` is the loss summed over their terms, and sums of further figures by name; ``count(item)``
+    its number of terms, ``length(item)`` its tokens. Metrics are named ``name/...``, those of the optimiser
+    ``steps/...``; ``seen`` names a metric of all terms so far. ``evaluate()`` gives the figures of held-out
+    items. ``save(folder, newest)`` writes the model into the run folder and returns numbers for its summary.
+    """
+
+    name: str
+    steps: str
+    items: Sequence[Any]
+    loss: Callable[[Sequence[Any]], tuple[Tensor, dict[str, Tensor]]]
+    count: Callable[[Any], int]
+    length: Callable[[Any], int]
+    evaluate: Callable[[], dict[str, float]]
+    save: Callable[[Path, dict[str, float]], dict[str, Any]] = lambda folder, newest: {}
+    seen: str | None = None
+
+
+class SupervisedLearner:
+    """The state of supervised training, a `Learner`: ``step`` optimiser steps, ``seen`` terms, the newest
+    value of every metric, and the micro-batch that fits into memory. A step is one minibatch.
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        parameters: Sequence[nn.Parameter],
+        settings: SupervisedSettings,
+        lines: Sequence[str] = (),
+    ) -> None:
+        self.objective = objective
+        self.parameters = parameters
+        self.settings = settings
+        self.lines = list(lines)
+        group = {"params": list(parameters), "lr": settings.learning_rate}
+        self.optimiser = Adam([group], eps=1e-8, fused=True)
+        self.steps_per_epoch = math.ceil(len(objective.items) / settings.minibatch_size)
+        self.step = 0
+        self.seen = 0
+        self.seconds = 0.0
+        self.rollbacks = 0
+        self.newest: dict[str, float] = {}
+        self.micro_batch_size = settings.micro_batch_size
+        self.changes: dict[str, Any] = {}
+
+    @property
+    def position(self) -> int:
+        """Optimiser steps so far."""
+        return self.step
+
+    @property
+    def total(self) -> int:
+        """Optimiser steps of all epochs."""
+        return self.steps_per_epoch * self.settings.num_epochs
+
+    @property
+    def complete(self) -> bool:
+        """Whether every epoch is over."""
+        return self.step >= self.total
+
+    @property
+    def merit(self) -> float | None:
+        """The newest figure of held-out examples; higher is better."""
+        loss = self.newest.get("sft/held_out_loss")
+        return self.newest.get("reward/held_out_accuracy") if loss is None else -loss
+
+    def settings_json(self) -> dict[str, Any]:
+        """The content of settings.json."""
+        return self.settings.to_json()
+
+    def changeable(self) -> SupervisedSettings:
+        """The settings of which some can be changed during the run."""
+        return self.settings
+
+    def begin(self) -> list[str]:
+        """The lines that describe model and data."""
+        return self.lines
+
+    def iterate(self) -> Iterator[Update]:
+        """One optimiser step at a time.
+
+        Raises NonFiniteError before a step with a NaN or an infinity in its gradient.
+        """
+        objective, total = self.objective, self.total
+        guard = StepGuard(self.parameters[0].device)
+        batches = minibatches(objective.items, self.settings, self.rollbacks)
+        for minibatch in islice(batches, self.step, None):
+            now = dataclasses.replace(self.settings, **self.changes)
+            rate = scheduled(now.learning_rate, now.learning_rate_schedule, self.step / total)
+            self.optimiser.param_groups[0]["lr"] = rate
+            memory = Parts(self.micro_batch_size)
+            metrics = take_step(objective, minibatch, self.optimiser, guard, now, memory)
+            metrics |= {f"{objective.steps}/learning_rate": rate or 0.0, **memory.metrics()}
+            self.step += 1
+            self.micro_batch_size = memory.size
+            self.seen += sum(objective.count(item) for item in minibatch)
+            if objective.seen is not None:
+                metrics[objective.seen] = float(self.seen)
+            on_grid = crosses(self.step - 1, self.step, total, now.checkpoint_every)
+            yield Update(self.step, total, metrics, self.step - 1, on_grid)
+
+    def evaluate(self, update: Update | None) -> dict[str, float]:
+        """Held-out figures before the first step and after every epoch."""
+        due = update is None or update.step % self.steps_per_epoch == 0
+        found = self.objective.evaluate() if due else {}
+        self.newest |= found if update is None else update.metrics | found
+        return found
+
+    def conclude(self) -> dict[str, float]:
+        """Nothing: the last epoch was evaluated."""
+        return {}
+
+    def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
+        """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
+        state = {
+            "story": self.objective.name,
+            "items": len(self.objective.items),
+            "step": self.step,
+            "seen": self.seen,
+            "seconds": self.seconds,
+            "newest": self.newest,
+            "micro_batch_size": self.micro_batch_size,
+            "rollbacks": self.rollbacks,
+        }
+        return tensors_of(self.parameters, self.optimiser), state
+
+    def restore(self, point: Checkpoint) -> None:
+        """Put back a checkpoint. ValueError for one of another command, or of other data."""
+        folder, tensors, state = point
+        if state.get("story") != self.objective.name:
+            raise ValueError(
+                f"{folder} is a checkpoint of {state.get('story')!r}, expected {self.objective.name!r}."
+            )
+        items = len(self.objective.items)
+        with understood(folder):
+            step, before = int(state["step"]), state["items"]
+            newest = {name: math.nan if x is None else float(x) for name, x in state["newest"].items()}
+            if before == items:
+                put_back(tensors, self.parameters, self.optimiser)
+            self.step = step
+            self.seen = int(state["seen"])
+            self.seconds = float(state["seconds"])
+            self.newest = newest
+            self.micro_batch_size = state["micro_batch_size"]
+            self.rollbacks = int(state.get("rollbacks", 0))
+        if before != items:
+            raise ValueError(
+                f"{folder.parent.parent} was learning from {before} examples, the data now have {items}. "
+                "Give the data that the run began with, or begin a new run."
+            )
+
+    def roll_back(self, point: Checkpoint) -> None:
+        """Put back a checkpoint of this run; examples come in another order from there on."""
+        rollbacks, size = self.rollbacks + 1, self.micro_batch_size
+        self.restore(point)
+        self.rollbacks = rollbacks
+        self.micro_batch_size = size
+
+    def finish(self, run: Run) -> dict[str, Any]:
+        """Write the model; returns the summary."""
+        numbers = self.objective.save(run.path, self.newest)
+        return {
+            "model": self.settings.model,
+            "seed": self.settings.seed,
+            **numbers,
+            "wall_seconds": self.newest.get("time/seconds", 0.0),
+            "final": {name: value for name, value in self.newest.items() if name != "time/seconds"},
+            "run_dir": str(run.path),
+        }
+
+
+def minibatches(
+    items: Sequence[Item], settings: SupervisedSettings, rollbacks: int = 0
+) -> Iterator[list[Item]]:
+    """Those of every step, in order: a function of the seed and the number of rollbacks only, wherever a run
+    is stopped. In the epoch of a rollback some examples come twice and others not at all.
+    """
+    rng = np.random.default_rng([settings.seed, rollbacks] if rollbacks else settings.seed)
+    size = settings.minibatch_size
+    for _ in range(settings.num_epochs):
+        order = rng.permutation(len(items))
+        for start in range(0, len(items), size):
+            yield [items[i] for i in order[start : start + size]]
+
+
+def take_step(
+    objective: Objective,
+    minibatch: Sequence[Any],
+    optimiser: torch.optim.Optimizer,
+    guard: StepGuard,
+    settings: SupervisedSettings,
+    parts: Parts | None = None,
+) -> dict[str, float]:
+    """One optimiser step on the mean over all terms of the minibatch, however it is split; ``parts`` knows
+    from the steps before what fits into memory.
+    """
+    parts = parts or Parts(settings.micro_batch_size)
+    meter = Meter()
+    count = sum(objective.count(item) for item in minibatch)
+
+    def gradient(size: int | None) -> dict[str, Tensor]:
+        sums = dict[str, Tensor]()
+        optimiser.zero_grad(set_to_none=True)
+        for part in micro_batches(minibatch, size, objective.length):
+            loss, figures = objective.loss(part)
+            (loss / count).backward()
+            for name, x in {"loss": loss.detach(), **figures}.items():
+                sums[name] = sums[name] + x if name in sums else x
+        return sums
+
+    sums = parts.fitting(len(minibatch), gradient, optimiser)
+    guard.refuse(~torch.isfinite(sums["loss"]))
+    guard.step(optimiser, settings.max_grad_norm, meter)
+    guard.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
+    metrics = {f"{objective.name}/{name}": float(x) / count for name, x in sums.items()}
+    metrics[f"{objective.steps}/grad_norm"] = meter.means()["train/grad_norm"]
+    return metrics
+
+
+def micro_batches(
+    items: Sequence[Item], size: int | None, length: Callable[[Item], int]
+) -> Iterator[list[Item]]:
+    """The items, sorted by length so that little is padded, ``size`` at a time (None: all at once)."""
+    ordered = sorted(items, key=length)
+    for start in range(0, len(ordered), size or max(1, len(ordered))):
+        yield ordered[start : start + (size or len(ordered))]

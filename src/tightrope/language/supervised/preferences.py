@@ -1,0 +1,223 @@
+"""The second stage: a reward model from preferences, and its scores.
+
+    L = -log sigmoid(r(chosen) - r(rejected)),  r(text) = w . h(last real token)      (Bradley, Terry 1952)
+
+A trained score is put to mean 0 and deviation 1 on demonstrations: r = w' . h - shift. w' = w / deviation is
+saved as the head, and shift = mean / deviation stands in config.json: the head has no bias to hold it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tightrope.language.data.batching import pad_right
+from tightrope.language.data.examples import Pair, hold_out, preference_pairs, read_rows, sft_examples
+from tightrope.language.model import lora
+from tightrope.language.model.parts import parts
+from tightrope.language.quiet import quiet
+from tightrope.language.reward.model import RewardModel
+from tightrope.language.settings import RewardSettings
+from tightrope.language.supervised.fit import Objective, micro_batches
+from tightrope.language.supervised.preferences_saving import reward_skeleton, save_reward
+from tightrope.language.supervised.prepare import Loaded, precision, prepared, training_rows
+from tightrope.language.supervised.run import recorded, reopened, train_supervised
+from tightrope.training.events import Listener, Listeners
+
+DEMONSTRATIONS = 1024  # texts on which scores are normalised, at most
+BINS = 10
+
+
+def make_head(width: int, seed: int) -> nn.Linear:
+    """A head [1, d] from N(0, 1 / sqrt(d + 1)), the deviation; without bias (Stiennon et al. 2020)."""
+    head = nn.utils.skip_init(nn.Linear, width, 1, bias=False)
+    noise = torch.randn(1, width, generator=torch.Generator().manual_seed(seed))
+    with torch.no_grad():
+        head.weight.copy_(noise / math.sqrt(width + 1))
+    return head
+
+
+def pair_loss(difference: Tensor) -> Tensor:
+    """-log sigmoid(r(chosen) - r(rejected)), summed over pairs [B]; nats."""
+    return -nn.functional.logsigmoid(difference).sum()
+
+
+def right_order(difference: Tensor) -> Tensor:
+    """1 where the chosen one scores higher, 0 where it does not, 1/2 where both score the same; [B]."""
+    return (difference.sign() + 1) / 2
+
+
+def calibration(difference: Tensor) -> tuple[float, list[dict[str, float]]]:
+    """The expected calibration error of sigmoid(|difference|), [N], and the table it comes from.
+
+    A pair's confidence is that of the order the model prefers, 0.5 to 1. By BINS equal bins of confidence:
+    pairs, mean confidence, accuracy; the error is the mean gap between the last two, weighted by pairs.
+    """
+    confidence = torch.sigmoid(difference.double().abs())
+    right = right_order(difference.double())
+    index = ((confidence - 0.5) * 2 * BINS).long().clamp(max=BINS - 1)
+    table, error = [], 0.0
+    for i in range(BINS):
+        inside = index == i
+        count = int(inside.sum())
+        if count:
+            mean, accuracy = float(confidence[inside].mean()), float(right[inside].mean())
+            error += count / len(difference) * abs(accuracy - mean)
+            begin, end = 0.5 + i / (2 * BINS), 0.5 + (i + 1) / (2 * BINS)
+            table.append({"from": begin, "to": end, "pairs": count, "confidence": mean, "accuracy": accuracy})
+    return error, table
+
+
+def differences(model: RewardModel, pairs: Sequence[Pair]) -> Tensor:
+    """r(chosen) - r(rejected) of pairs [B], differentiable; both texts of a pair in one forward pass."""
+    texts = [pair.chosen for pair in pairs] + [pair.rejected for pair in pairs]
+    tokens, real = (x.to(model.head.weight.device) for x in pad_right(texts))
+    chosen, rejected = model.raw(tokens, real, right=True).chunk(2)
+    return chosen - rejected
+
+
+def longest(pair: Pair) -> int:
+    """The tokens of the longer text of a pair."""
+    return max(len(pair.chosen), len(pair.rejected))
+
+
+@torch.no_grad()
+def normalise(model: RewardModel, texts: Sequence[Sequence[int]], size: int) -> tuple[float, float]:
+    """Put the scores to mean 0 and deviation 1 on these texts; returns what mean and deviation were.
+
+    Scores that are all the same keep their scale.
+    """
+    parts_of = micro_batches(texts, size, len)
+    batches = [tuple(x.to(model.head.weight.device) for x in pad_right(part)) for part in parts_of]
+    scores = torch.cat([model.raw(tokens, real, right=True) for tokens, real in batches]).double()
+    mean, deviation = float(scores.mean()), float(scores.std(correction=0))
+    gain = 1 / deviation if deviation > 1e-6 else 1.0
+    model.head.weight.mul_(gain)
+    model.shift = mean * gain
+    return mean, deviation
+
+
+@quiet()
+def train_reward(
+    settings: RewardSettings,
+    *,
+    data: Any = None,
+    validation: Any = None,
+    demonstrations: Any = None,
+    model: tuple[Any, Any] | None = None,
+    listeners: Sequence[Listener] = (),
+    run_dir: str | Path | None = None,
+) -> dict[str, Any]:
+    """Train a reward model; returns the summary that is also written to the run folder.
+
+    ``data`` and ``validation`` replace the files that the settings name: rows in any format of
+    `preference_pairs`; ``demonstrations``: rows of `sft_examples`. ``model``: a causal (model, tokenizer),
+    whose trunk is trained in place. The run folder holds settings.json, metrics.jsonl, summary.json (with the
+    calibration table) and ``model``, which AutoModelForSequenceClassification.from_pretrained loads; tuned by
+    LoRA also ``adapter``, which PEFT loads and alignment puts on its own trunk.
+    Raises ValueError for data or settings that cannot work, before anything is trained, and DoesNotFit, which
+    is one, for too little memory, before the model is loaded.
+    """
+    given = {"data": data, "validation": validation, "demonstrations": demonstrations}
+    settings = recorded(settings, **given, model=model and model[0])
+    told = Listeners(listeners)
+    with prepared(settings, "reward", model, told) as loaded:
+        return _train(settings, loaded, given, told, run_dir)
+
+
+@quiet()
+def resume_reward(
+    run_dir: str | Path,
+    *,
+    data: Any = None,
+    validation: Any = None,
+    demonstrations: Any = None,
+    model: tuple[Any, Any] | None = None,
+    listeners: Sequence[Listener] = (),
+) -> dict[str, Any]:
+    """Go on with a run of `train_reward`, as `resume_sft` does with one of `train_sft`."""
+    given = {"data": data, "validation": validation, "demonstrations": demonstrations}
+    run, settings = reopened(RewardSettings, run_dir, **given, model=model and model[0])
+    told = Listeners(listeners)
+    with run, prepared(settings, "reward", model, told) as loaded:
+        return _train(settings, loaded, given, told, run)
+
+
+def _train(
+    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners, place: Any
+) -> dict[str, Any]:
+    base, size = parts(loaded.model).base, settings.micro_batch_size or settings.minibatch_size
+    head = make_head(loaded.model.config.hidden_size, settings.seed).to(settings.device)
+    model, skeleton = RewardModel(base, head, 0.0, loaded.tokenizer), reward_skeleton(loaded)
+    pairs, held, texts = _data(settings, loaded, listeners, **given)
+
+    def loss(items: Sequence[Pair]) -> tuple[Tensor, dict[str, Tensor]]:
+        with precision(settings):
+            found = differences(model, items)
+        seen = found.detach()
+        return pair_loss(found), {"accuracy": right_order(seen).sum(), "margin": seen.sum()}
+
+    @torch.no_grad()
+    def held_out() -> Tensor:
+        with precision(settings):
+            return torch.cat([differences(model, part) for part in micro_batches(held, size, longest)])
+
+    def evaluate() -> dict[str, float]:
+        if not held:
+            return {}
+        found = held_out()
+        accuracy = float(right_order(found).mean())
+        return {"reward/held_out_accuracy": accuracy, "reward/calibration_error": calibration(found)[0]}
+
+    def save(folder: Path, newest: dict[str, float]) -> dict[str, Any]:
+        table = calibration(held_out())[1] if held else []
+        with precision(settings):
+            mean, deviation = normalise(model, texts, size)
+        save_reward(skeleton, loaded, head.weight, model.shift, folder, newest)
+        return {
+            "pairs": len(pairs),
+            "held_out_pairs": len(held),
+            "calibration": table,
+            "score_mean": mean,
+            "score_deviation": deviation,
+            "demonstrations": len(texts),
+        }
+
+    trunk = list(base.parameters())
+    if loaded.adapter is not None:
+        trunk = lora.adapter_parameters(loaded.model, loaded.adapter)
+    parameters = [*trunk, *head.parameters()]
+    objective = Objective("reward", "train", pairs, loss, lambda pair: 1, longest, evaluate, save)
+    words = f"{len(pairs)} pairs; {len(held)} held out"
+    return train_supervised(objective, parameters, settings, loaded, place, listeners, words)
+
+
+def _data(
+    settings: RewardSettings,
+    loaded: Loaded,
+    listeners: Listeners,
+    data: Any,
+    validation: Any,
+    demonstrations: Any,
+) -> tuple[list[Pair], list[Pair], list[tuple[int, ...]]]:
+    """Pairs to train on, pairs held out (whole prompts, where there are many), and texts to normalise on."""
+    reading: dict[str, Any] = {"eos": loaded.eos, "max_tokens": settings.max_tokens, "notify": listeners.warn}
+    pairs = preference_pairs(training_rows(settings, data), loaded.tokenizer, **reading)
+    held: list[Pair] = []
+    if (source := settings.validation if validation is None else validation) is not None:
+        held = preference_pairs(read_rows(source), loaded.tokenizer, **reading)
+    else:
+        pairs, held = hold_out(
+            pairs, settings.held_out, settings.seed, lambda pair: pair.chosen[: pair.prompt_length]
+        )
+    texts = [pair.chosen for pair in pairs]
+    if (source := settings.demonstrations if demonstrations is None else demonstrations) is not None:
+        texts = [example.tokens for example in sft_examples(read_rows(source), loaded.tokenizer, **reading)]
+    order = np.random.default_rng([settings.seed, 2]).permutation(len(texts))[:DEMONSTRATIONS]
+    return pairs, held, [texts[i] for i in order]

@@ -1,0 +1,195 @@
+"""The first stage: supervised fine-tuning of a causal language model on text, completions or chats.
+
+L = - sum over learnt tokens of log p(token | what stands before it) / their number in the minibatch
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tightrope.language.data.batching import Example, Packed, attention_of, collate, pack, row_of
+from tightrope.language.data.examples import Row, hold_out, read_rows, sft_examples
+from tightrope.language.generation.distribution import Sampling, token_statistics
+from tightrope.language.model import lora
+from tightrope.language.model.parts import attention_window, parts
+from tightrope.language.model.saving import save_adapter, write_model
+from tightrope.language.quiet import quiet
+from tightrope.language.settings import SFTSettings
+from tightrope.language.supervised.fit import Objective, micro_batches
+from tightrope.language.supervised.prepare import Loaded, precision, prepared, training_rows
+from tightrope.language.supervised.run import recorded, reopened, train_supervised
+from tightrope.runs.durable import whole
+from tightrope.training.events import Listener, Listeners
+
+PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
+
+
+def hidden_states(model: Any, rows: Packed) -> Tensor:
+    """Hidden states [B, N, d] of right-padded rows; no text sees padding, or another text of its row."""
+    base = parts(model).base
+    if not bool((rows.segments > 0).any()):
+        # One text a row: padding stands behind it, where causal attention never looks.
+        return base(input_ids=rows.tokens, use_cache=False).last_hidden_state
+    allowed = attention_of(rows.segments)
+    # Added to the scores by every implementation of attention; some would add a boolean mask as 0 and 1.
+    mask = torch.zeros(allowed.shape, dtype=model.dtype, device=allowed.device)
+    mask.masked_fill_(~allowed, torch.finfo(model.dtype).min)
+    out = base(input_ids=rows.tokens, attention_mask=mask, position_ids=rows.positions, use_cache=False)
+    return out.last_hidden_state
+
+
+@torch.no_grad()
+def require_packable(model: Any, longest: int) -> None:
+    """ValueError for a model whose loss would not be the same when texts share a row of ``longest`` tokens:
+    one whose attention looks back over a shorter window, or that reads attention masks in another way.
+    """
+    name, window = type(model).__name__, attention_window(model)
+    if window is not None and window < longest:
+        raise ValueError(
+            f"--pack with {name}, some layers of which look back over {window} tokens, and max_tokens "
+            f"{longest}: in packed rows they would look further. Leave --pack out, or choose --max-tokens "
+            f"{window} or less."
+        )
+    texts = [Example(tuple(range(size)), (False, *(True,) * (size - 1))) for size in (5, 4)]
+    apart = token_loss(model, collate([row_of([text]) for text in texts]).to(model.device))
+    gap, reason = float("inf"), ""
+    try:
+        gap = float((token_loss(model, row_of(texts).to(model.device)) / apart - 1).abs())
+    except (TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
+        reason = f" ({error})"
+    if gap > (PACKED_GAP if model.dtype == torch.float32 else 0.05):
+        raise ValueError(
+            f"--pack with {name}: two texts in one row give another loss than apart, relative gap {gap:.1e}"
+            f"{reason}. The model reads attention masks in another way. Leave --pack out."
+        )
+
+
+def token_loss(model: Any, rows: Packed) -> Tensor:
+    """-log p summed over the learnt tokens, a scalar in nats; divide by ``rows.learn.sum()`` for the mean."""
+    head, targets = parts(model).head, rows.learn[:, 1:]
+    hidden = hidden_states(model, rows)[:, :-1][targets].to(head.weight.dtype)
+    with torch.autocast(hidden.device.type, enabled=False):
+        return -token_statistics(hidden, head, rows.tokens[:, 1:][targets], Sampling()).logp.sum()
+
+
+@torch.no_grad()
+def mean_loss(model: Any, rows: Sequence[Packed], size: int) -> float:
+    """The mean loss per learnt token over all rows, ``size`` rows at a time; nats."""
+    total, count = 0.0, 0
+    for part in micro_batches(rows, size, len):
+        batch = collate(part).to(model.device)
+        total, count = total + float(token_loss(model, batch)), count + int(batch.learn.sum())
+    return total / count
+
+
+@quiet()
+def train_sft(
+    settings: SFTSettings,
+    *,
+    data: Any = None,
+    validation: Any = None,
+    model: tuple[Any, Any] | None = None,
+    listeners: Sequence[Listener] = (),
+    run_dir: str | Path | None = None,
+) -> dict[str, Any]:
+    """Fine-tune a model; returns the summary that is also written to the run folder.
+
+    ``data`` and ``validation`` replace the files that the settings name: rows in any format of
+    `sft_examples`. ``model``: a (model, tokenizer) that is trained in place. The run folder holds
+    settings.json, metrics.jsonl, summary.json and ``model``, which AutoModelForCausalLM.from_pretrained
+    loads, with tokenizer and chat template; tuned by LoRA the adapter is folded into it, and lies in
+    ``adapter`` for PEFT as well. Raises ValueError for data or settings that cannot work, before anything is
+    trained, and DoesNotFit, which is one, for too little memory, before the model is loaded.
+    """
+    settings = recorded(settings, data=data, validation=validation, model=model and model[0])
+    told = Listeners(listeners)
+    with prepared(settings, "sft", model, told) as loaded:
+        return _train(settings, loaded, data, validation, told, run_dir)
+
+
+@quiet()
+def resume_sft(
+    run_dir: str | Path,
+    *,
+    data: Any = None,
+    validation: Any = None,
+    model: tuple[Any, Any] | None = None,
+    listeners: Sequence[Listener] = (),
+) -> dict[str, Any]:
+    """Go on from a run's newest checkpoint, or from its beginning where there is none yet; the end is that of
+    a run without a break, bit for bit.
+
+    What `train_sft` was given as an object is given again, the model as it was before training. Files are
+    read again. ValueError names what is missing.
+    """
+    given = {"data": data, "validation": validation, "model": model and model[0]}
+    run, settings = reopened(SFTSettings, run_dir, **given)
+    told = Listeners(listeners)
+    with run, prepared(settings, "sft", model, told) as loaded:
+        return _train(settings, loaded, data, validation, told, run)
+
+
+def _train(
+    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, listeners: Listeners, place: Any
+) -> dict[str, Any]:
+    model, size = loaded.model, settings.micro_batch_size or settings.minibatch_size
+    rows, held = _rows(settings, loaded, data, validation, listeners)
+
+    def loss(items: Sequence[Packed]) -> tuple[Tensor, dict[str, Tensor]]:
+        with precision(settings):
+            return token_loss(model, collate(items).to(model.device)), {}
+
+    def evaluate() -> dict[str, float]:
+        with precision(settings):
+            return {"sft/held_out_loss": mean_loss(model, held, size)} if held else {}
+
+    learnt = sum(_learnt(row) for row in rows)
+
+    def save(folder: Path, newest: dict[str, float]) -> dict[str, Any]:
+        write_model(model, loaded.tokenizer, folder / "model", loaded.adapter)
+        if loaded.adapter is not None:
+            with whole(folder / "adapter") as inner:
+                save_adapter(model, loaded.adapter, inner, base_model=loaded.source)
+        return {"rows": len(rows), "held_out_rows": len(held), "tokens": learnt}
+
+    parameters = list(model.parameters())
+    if loaded.adapter is not None:
+        parameters = lora.adapter_parameters(model, loaded.adapter)
+    objective = Objective("sft", "sft", rows, loss, _learnt, len, evaluate, save, seen="sft/tokens")
+    words = f"{len(rows)} rows, {learnt:,} tokens to learn; {len(held)} rows held out"
+    return train_supervised(objective, parameters, settings, loaded, place, listeners, words)
+
+
+def _learnt(row: Packed) -> int:
+    return int(row.learn.sum())
+
+
+def _rows(
+    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, listeners: Listeners
+) -> tuple[list[Packed], list[Packed]]:
+    """The rows to train on and those held out; packed apart, so that nothing held out is trained on."""
+
+    def examples(source: list[Row]) -> list[Example]:
+        return sft_examples(
+            source,
+            loaded.tokenizer,
+            eos=loaded.eos,
+            max_tokens=settings.max_tokens,
+            on_completions=settings.on_completions,
+            notify=listeners.warn,
+        )
+
+    own, held = examples(training_rows(settings, data)), []
+    if (source := settings.validation if validation is None else validation) is not None:
+        held = examples(read_rows(source))
+    else:
+        own, held = hold_out(own, settings.held_out, settings.seed)
+    if settings.pack:
+        require_packable(loaded.model, settings.max_tokens)
+        return pack(own, settings.max_tokens), pack(held, settings.max_tokens)
+    return [row_of([example]) for example in own], [row_of([example]) for example in held]

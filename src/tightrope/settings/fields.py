@@ -1,0 +1,131 @@
+"""How a setting is declared: default, help text, range and type. The only reader of their annotations.
+
+The command line, the checks and the docs all read the declaration.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from types import NoneType, UnionType
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+Schedule = Literal["constant", "linear", "cosine"]
+SCHEDULES = get_args(Schedule)
+
+
+def setting(
+    default: Any,
+    doc: str,
+    *,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    above: float = -math.inf,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field with its help text and its range.
+
+    ``at_least`` and ``at_most`` are inclusive, ``above`` is exclusive, ``choices`` lists the words allowed.
+    A default of None means the setting is optional and ``none`` on the command line switches it off.
+    """
+    metadata = {"doc": doc, "at_least": at_least, "at_most": at_most, "above": above, "choices": choices}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def fixed(value: Any) -> Any:
+    """A field of a base class that has one value here: written to settings.json, never given."""
+    return dataclasses.field(default=value, init=False)
+
+
+def of_update_rule(rules: Mapping[str, type]) -> Any:
+    """The field ``update``: the settings of the update rule. ``rules`` holds their class by algorithm, the
+    default one first.
+    """
+    first = next(iter(rules.values()))
+    return dataclasses.field(default_factory=first, metadata={"doc": "The update rule's.", "rules": rules})
+
+
+def range_text(metadata: Mapping[str, Any]) -> str:
+    """The range of a field in words: ``0 < x <= 1``, ``a | b``, or an empty string when anything goes."""
+    if metadata["choices"]:
+        return " | ".join(metadata["choices"])
+    above, at_least, at_most = (metadata[name] for name in ("above", "at_least", "at_most"))
+    low = f"{above:g} < " if above > -math.inf else f"{at_least:g} <= " if at_least > -math.inf else ""
+    high = f" <= {at_most:g}" if at_most < math.inf else ""
+    return f"{low}x{high}" if low or high else ""
+
+
+class Kind(NamedTuple):
+    """The values a field takes: those of one type (tuple: whole numbers), and None where it is optional."""
+
+    type: type
+    optional: bool
+
+    def __str__(self) -> str:
+        """In words, for errors."""
+        name = "whole numbers in a tuple or list" if self.type is tuple else self.type.__name__
+        return f"{name} or None" if self.optional else name
+
+
+@functools.cache
+def kinds(settings: type) -> dict[str, Kind]:
+    """The kind of each field of a settings class, by name, from its annotation."""
+    hints = get_type_hints(settings)
+    return {field.name: _kind(hints[field.name]) for field in dataclasses.fields(settings)}
+
+
+def _kind(hint: Any) -> Kind:
+    options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    plain = {Literal: str, tuple: tuple}.get(get_origin(options[0]), options[0])
+    return Kind(plain, NoneType in options)
+
+
+def typed(name: str, value: Any, kind: Kind) -> Any:
+    """``value`` as its field holds it: a list as a tuple, a whole number as a float where one is expected.
+
+    Raises ValueError for a value of another kind. The settings of an update rule are let through.
+    """
+    if value is None and kind.optional:
+        return None
+    if kind.type is tuple and isinstance(value, list | tuple) and all(type(x) is int for x in value):
+        return tuple(value)
+    if kind.type is float and type(value) is int:
+        return float(value)
+    if type(value) is kind.type or dataclasses.is_dataclass(kind.type):
+        return value
+    raise ValueError(f"{name} is {value!r} ({type(value).__name__}); expected {kind}.")
+
+
+def check(settings: Any) -> None:
+    """Raise ValueError naming the first field of a wrong kind or outside its declared range."""
+    kind: type = type(settings)
+    for field in dataclasses.fields(settings):
+        value = typed(field.name, getattr(settings, field.name), kinds(kind)[field.name])
+        object.__setattr__(settings, field.name, value)
+        _check_range(field, value)
+
+
+def _check_range(field: dataclasses.Field[Any], value: Any) -> None:
+    limits = field.metadata
+    if isinstance(value, str) and limits["choices"] and value not in limits["choices"]:
+        raise ValueError(f"{field.name} is {value!r}; expected one of: {', '.join(limits['choices'])}.")
+    for number in value if isinstance(value, tuple) else (value,):
+        if type(number) not in (int, float):
+            continue
+        inside = limits["at_least"] <= number <= limits["at_most"] and number > limits["above"]
+        if not inside or not math.isfinite(number):
+            expected = range_text(limits) or "a finite number"
+            raise ValueError(f"{field.name} is {value!r}; expected {expected}. Choose a value in that range.")
+
+
+def scheduled(value: float | None, schedule: Schedule, progress: float) -> float | None:
+    """The value of a schedule at ``progress`` in [0, 1]; linear and cosine fall from the value to 0.
+
+    linear: value * (1 - progress);  cosine: value * (1 + cos(pi * progress)) / 2;  None stays None.
+    """
+    if value is None or schedule == "constant":
+        return value
+    factor = 1.0 - progress if schedule == "linear" else 0.5 * (1.0 + math.cos(math.pi * progress))
+    return value * factor

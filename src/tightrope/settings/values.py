@@ -1,0 +1,117 @@
+"""What every settings class can do: check itself, change values, be written to settings.json and read."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+from tightrope.settings.fields import check, kinds, typed
+from tightrope.settings.peer_names import PEER_NAMES
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Frozen values, checked where they are made. A field ``update`` holds those of the update rule, whose
+    names are used as if they were fields of this class.
+    """
+
+    def __post_init__(self) -> None:
+        """Check every field: its kind, its range, and the class of ``update``."""
+        check(self)
+        rule = rule_of(type(self), getattr(self, "algorithm", None))
+        update = getattr(self, "update", None)
+        if rule is not None and not isinstance(update, rule):
+            raise ValueError(f"update is {type(update).__name__}; expected {rule.__name__}.")
+
+    def with_values(self, **values: Any) -> Self:
+        """The same settings with these changed; names of the update rule's fields are found there."""
+        algorithm = values.get("algorithm", getattr(self, "algorithm", None))
+        rule, outer = rule_of(type(self), algorithm), names(type(self))
+        _require_known(algorithm or type(self).__name__, values, outer | names(rule))
+        changed = {name: value for name, value in values.items() if name in outer}
+        inner = {name: value for name, value in values.items() if name not in outer}
+        if rule is not None:
+            present = getattr(self, "update", None)
+            update = values.get("update", present if isinstance(present, rule) else rule())
+            changed["update"] = dataclasses.replace(update, **inner) if isinstance(update, rule) else update
+        return dataclasses.replace(self, **changed)
+
+    def to_json(self) -> dict[str, Any]:
+        """The settings as settings.json holds them: plain JSON types, the update rule's under ``update``."""
+
+        def plain(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+            return {name: list(value) if isinstance(value, tuple) else value for name, value in pairs}
+
+        return dataclasses.asdict(self, dict_factory=plain)
+
+    @classmethod
+    def from_json(cls, data: Any, source: object = "settings.json") -> Self:
+        """The settings that `to_json` wrote; a name that is missing has its default. Raises ValueError."""
+        return cls().with_values(**cls.values_from_json(data, source))
+
+    @classmethod
+    def values_from_json(cls, data: Any, source: object = "settings.json") -> dict[str, Any]:
+        """The values in a settings.json, flat, as `with_values` takes them.
+
+        Raises ValueError for an unknown name, a value of another type, and a name in both places.
+        """
+        try:
+            return _flat(cls, data)
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from None
+
+
+def names(kind: type | None) -> set[str]:
+    """The names of the fields that may be given; none for None."""
+    return set() if kind is None else {field.name for field in dataclasses.fields(kind) if field.init}
+
+
+def rule_of(kind: type[Settings], algorithm: Any) -> type[Settings] | None:
+    """The class of ``update`` for an algorithm (None: the default one); None for settings without it.
+
+    Raises ValueError for an unknown algorithm.
+    """
+    field = next((field for field in dataclasses.fields(kind) if field.name == "update"), None)
+    if field is None:
+        return None
+    rules: Mapping[str, type[Settings]] = field.metadata["rules"]
+    if algorithm is None:
+        return next(iter(rules.values()))
+    if algorithm not in list(rules):
+        raise ValueError(f"algorithm is {algorithm!r}; expected one of: {', '.join(rules)}.")
+    return rules[algorithm]
+
+
+def _flat(kind: type[Settings], data: Any) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise ValueError(f"the settings are {type(data).__name__}, expected an object with names and values.")
+    outer = {name: value for name, value in data.items() if name != "update" or name not in names(kind)}
+    values = _read(kind, outer)
+    rule = rule_of(kind, values.get("algorithm"))
+    if rule is None:
+        return values
+    inner = data.get("update", {})
+    if not isinstance(inner, dict):
+        raise ValueError(f"update is {inner!r}; expected an object with the settings of the update rule.")
+    return values | _read(rule, inner)
+
+
+def _read(kind: type, values: dict[str, Any]) -> dict[str, Any]:
+    """Values of one class by name, each of the kind of its field; those of fixed fields are left out."""
+    given = names(kind)
+    _require_known(kind.__name__, values, kinds(kind))
+    return {name: typed(name, value, kinds(kind)[name]) for name, value in values.items() if name in given}
+
+
+def _require_known(owner: str, values: Collection[str], known: Collection[str]) -> None:
+    """ValueError for a name that is no setting, with the one that was probably meant."""
+    for name in values:
+        if name not in known:
+            near = [PEER_NAMES.get(name, ""), *difflib.get_close_matches(name, known, n=1)]
+            hint = next(
+                (f" Did you mean {meant!r}?" for meant in near if meant.partition(" ")[0] in known), ""
+            )
+            raise ValueError(f"{owner} has no setting named {name!r}.{hint}")

@@ -1,0 +1,125 @@
+"""What the training loop trains: control agents, alignment, supervised fine-tuning and reward models."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from tightrope.runs.history import Checkpoint
+from tightrope.runs.run import Run
+from tightrope.training.parameters import Tensors
+
+# settings that are read before every update, so that a listener can change them during a run
+CHANGEABLE = (
+    "learning_rate", "critic_learning_rate", "clip", "clip_high", "value_clip", "target_kl",
+    "entropy_weight", "value_weight", "max_grad_norm",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Update:
+    """One update: the steps so far, the budget, every metric, and what was collected for it.
+
+    ``before``: ``step`` before the update. ``on_grid``: it reached a point of the checkpoint grid, whether or
+    not anything is saved. ``episodes`` that ended: (return, length, terminated). ``samples``: rows of
+    samples.jsonl. ``pause``: seconds of it that were not training.
+    """
+
+    step: int
+    total_steps: int
+    metrics: dict[str, float]
+    before: int
+    on_grid: bool = False
+    episodes: list[tuple[float, int, bool]] = field(default_factory=list)
+    samples: list[dict[str, Any]] = field(default_factory=list)
+    pause: float = 0.0
+
+
+class Learner(Protocol):
+    """State and updates of a run; `loop.train` does everything else.
+
+    ``seconds`` of training and ``changes`` of settings are kept by the loop.
+    """
+
+    seconds: float
+    changes: dict[str, Any]
+
+    @property
+    def settings(self) -> Any:
+        """The settings of the command."""
+
+    @property
+    def rollbacks(self) -> int:
+        """How often `roll_back` was called in this run."""
+
+    @property
+    def position(self) -> int:
+        """Steps so far."""
+
+    @property
+    def total(self) -> int:
+        """Steps of the whole run."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether no update is left."""
+
+    @property
+    def merit(self) -> float | None:
+        """How good the present state is: the best checkpoint is kept. None: not known."""
+
+    def settings_json(self) -> dict[str, Any]:
+        """The content of settings.json."""
+
+    def changeable(self) -> Any:
+        """The settings of which those in `CHANGEABLE` can be changed during the run."""
+
+    def begin(self) -> list[str]:
+        """Prepare for the first update; returns lines that describe the run."""
+
+    def iterate(self) -> Iterator[Update]:
+        """The updates from the present position on."""
+
+    def evaluate(self, update: Update | None) -> dict[str, float]:
+        """The figures that are due after this update (None: before the first); empty when none are."""
+
+    def conclude(self) -> dict[str, float]:
+        """After the last update and before the last save: the final figures, where there are any."""
+
+    def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
+        """Everything that `restore` needs, as tensors and JSON."""
+
+    def restore(self, point: Checkpoint) -> None:
+        """Put back a checkpoint. ValueError when it is not one of this run."""
+
+    def roll_back(self, point: Checkpoint) -> None:
+        """Put back a checkpoint with other random numbers from there on, and count it."""
+
+    def finish(self, run: Run) -> dict[str, Any]:
+        """Write what the run leaves behind besides checkpoints; returns the summary."""
+
+
+def change(learner: Learner, setting: str, value: Any) -> None:
+    """Use another value of a setting from the next update on. ValueError for what cannot be changed."""
+    settings = learner.changeable()
+    names = [name for name in CHANGEABLE if hasattr(settings, name)]
+    if setting not in names:
+        raise ValueError(f"{setting!r} cannot change during a run; these can: {', '.join(names)}.")
+    if isinstance(value, bool) or not isinstance(value, int | float | None):
+        raise ValueError(f"{setting} is to become {value!r}; expected a number or None.")
+    dataclasses.replace(settings, **{setting: value})  # checks the range
+    learner.changes[setting] = value
+
+
+def crosses(before: float, after: float, total: float, fraction: float | None) -> bool:
+    """Whether ``fraction * total``, ``2 fraction * total``, ... has a member in (before, after].
+
+    Several at once count as one; ``fraction`` None: there are no points. The total itself is one where the
+    fraction divides it. Steps that miss a point by a rounding error of their share have reached it.
+    """
+    if fraction is None:
+        return False
+    first, last = (int(step / total / fraction + 1e-9) for step in (before, after))
+    return last > first

@@ -1,0 +1,26 @@
+"""Every tensor that training changes, out of the model and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
+
+Tensors = dict[str, dict[str, Tensor]]
+
+
+def tensors_of(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> Tensors:
+    """Every tensor that training changes, in the order of ``parameters``, and the optimiser's moments."""
+    trained = {f"{index:05d}": parameter.data for index, parameter in enumerate(parameters)}
+    return {"trained": trained, "optimiser": optimiser_tensors(optimiser)}
+
+
+@torch.no_grad()
+def put_back(tensors: Tensors, parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> None:
+    """Copy what `tensors_of` gave into the same parameters and their optimiser."""
+    for index, parameter in enumerate(parameters):
+        parameter.copy_(tensors["trained"][f"{index:05d}"])
+    restore_optimiser(optimiser, tensors["optimiser"])

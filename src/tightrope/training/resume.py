@@ -1,0 +1,35 @@
+"""Where a run continues: at its newest checkpoint, with the changes of settings that were made before it."""
+
+from __future__ import annotations
+
+from tightrope.runs.checkpoint import understood
+from tightrope.runs.history import Checkpoint, steps_in
+from tightrope.runs.run import Run
+from tightrope.training.events import Listeners
+from tightrope.training.learner import Learner, change
+
+
+def newest_point(run: Run, listeners: Listeners) -> Checkpoint | None:
+    """The newest checkpoint that can be used; None where the run has saved nothing yet."""
+    if steps_in(run.checkpoints):
+        return run.resume_point(listeners.tell)
+    if run.read_metrics():
+        listeners.warn(f"{run.path} has rows and no checkpoint; it begins at step 0 again.")
+    return None
+
+
+def continue_from(learner: Learner, run: Run, point: Checkpoint | None) -> None:
+    """Bring the run folder to where the learner is: at ``point`` (None: at the beginning). Rows behind it go,
+    and settings.json holds the present settings.
+    """
+    run.rewind(point)
+    run.update_settings(learner.settings_json())
+    restore_changes(learner, run)
+
+
+def restore_changes(learner: Learner, run: Run) -> None:
+    """The changes of settings that the run has recorded, and no others."""
+    learner.changes.clear()
+    with understood(run.path):
+        for row in run.read_changes():
+            change(learner, row["setting"], row["value"])

@@ -1,0 +1,43 @@
+"""A listener that writes the metrics of every update as TensorBoard files, in the folder of the run."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from tightrope.training.events import Event, Finished, Started, Updated
+
+
+class TensorBoard:
+    """Raises ValueError where the package is missing."""
+
+    def __init__(self) -> None:
+        self._make: Any = require_tensorboard(True)
+        self._writer: Any = None
+
+    def __call__(self, event: Event) -> None:
+        """Write the scalars of an update; those that are not finite are left out."""
+        if isinstance(event, Started):
+            self._writer = self._make(str(Path(event.run_dir) / "tensorboard"))
+        elif isinstance(event, Updated):
+            for name, value in event.metrics.items():
+                if value is not None and math.isfinite(value):
+                    self._writer.add_scalar(name, float(value), event.step)
+            self._writer.flush()
+        elif isinstance(event, Finished):
+            self._writer.close()
+
+
+def require_tensorboard(wanted: bool) -> Any:
+    """TensorBoard's writer class, where it is wanted. ValueError where the package is missing."""
+    if not wanted:
+        return None
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ValueError(
+            "TensorBoard files are asked for, and the package tensorboard is not installed. "
+            "Install it with: pip install 'tightrope[tensorboard]', or leave --tensorboard out."
+        ) from error
+    return SummaryWriter
