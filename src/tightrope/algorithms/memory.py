@@ -78,7 +78,7 @@ class Parts:
         at a time; once more at half the size when memory runs out, with torch's random numbers from the same
         state on.
 
-        Whatever else ``attempt`` changes it must set anew: draw and count outside of it.
+        ``attempt`` must set whatever else it changes again: draw and count outside of it.
         """
         start_over = _random_state()
         while True:

@@ -52,7 +52,7 @@ def _supervised(name: str, words: list[str]) -> int:
 
 
 def _stage(name: str) -> tuple[Callable[..., dict[str, Any]], Callable[..., dict[str, Any]], Any]:
-    """How stage one or two is trained, how gone on with, and the columns that show it."""
+    """How stage one or two is trained and resumed, and the columns that show it."""
     _require_transformers()
     from tightrope.cli import display
 

@@ -88,7 +88,7 @@ class Agent:
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
         self.steps, self.rollbacks, self.kl_beta = 0, 0, getattr(present.update, "kl_beta", None)
         self.changes: dict[str, Any] = {}  # of the update rule's settings, made by a listener
-        self.fresh, self.notify = True, notify  # fresh: episodes begin anew with the next rollout
+        self.fresh, self.notify = True, notify  # fresh: new episodes begin with the next rollout
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
 
     # ---------------------------------------------------------------------------------------------- learning

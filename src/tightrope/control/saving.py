@@ -28,7 +28,7 @@ def load(
 
     ``env``: needed when the saved one was no plain Gymnasium id; another id is a warm start.  ``policy``:
     needed when the saved policy was a module of your own.  ``engine``: who computes further updates (auto,
-    fused, torch); with another ``device`` it is chosen anew.
+    fused, torch); with another ``device`` it is chosen again.
     """
     folder, tensors, state = read(Path(path), best=best)
     with checkpoint.understood(folder):

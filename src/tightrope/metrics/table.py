@@ -30,7 +30,7 @@ _TABLE = (
         "rollout/environment_restarts",
         "restarts",
         "down",
-        "Environments, or processes of them, made anew after a fault in this rollout; with on_env_fault "
+        "Environments, or processes of them, restarted after a fault in this rollout; with on_env_fault "
         "restart alone.",
         high=0.0,
     ),
