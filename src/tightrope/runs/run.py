@@ -72,8 +72,8 @@ class Run:
         """An existing run folder. Raises ValueError where there is none, naming a near one, and for links
         inside it.
 
-        ``own``: for a caller that continues the run. The writer's lock is taken before anything is read, so that
-        no other writer changes what was read. Raises RunInUse where there is one, and ValueError when
+        ``own``: for a caller that continues the run. The writer's lock is taken before anything is read, so
+        that no other writer changes what was read. Raises RunInUse where there is one, and ValueError when
         settings.json is not as the run wrote it.
         """
         path = Path(path)

@@ -1,7 +1,7 @@
 """SIGINT and SIGTERM: a run stops at once, but for a save under way, which is finished first.
 
-Nothing is saved because of a signal: checkpoints lie where the settings put them, so a stopped and resumed run
-ends exactly like an uninterrupted one. A second signal does not wait for the save either.
+Nothing is saved because of a signal: checkpoints lie where the settings put them, so a stopped and resumed
+run ends exactly like an uninterrupted one. A second signal does not wait for the save either.
 """
 
 from __future__ import annotations
