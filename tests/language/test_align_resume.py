@@ -12,6 +12,7 @@ import pytest
 import torch
 from language.tiny import saved, tiny_llama
 
+from tightrope.algorithms import descent
 from tightrope.cli.main import main
 from tightrope.language.alignment import align as alignment
 from tightrope.language.alignment import iteration as trainer
@@ -101,7 +102,7 @@ def killed(run: Path, values: dict, patch: Any, place: Any, name: str, call: int
 PHASES = {
     "first sampling": (trainer, "gather", 1),
     "scores": (trainer, "rewards_of", 4),
-    "update": (trainer.ppo, "check_first_ratios", 5),
+    "update": (descent, "check_first_ratios", 5),
     "row": (Run, "record", 3),
     "samples": (Run, "record_samples", 5),
     "save": ("tightrope.runs.checkpoint", "write_file", 4),
