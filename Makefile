@@ -51,9 +51,9 @@ bench: $(VENV)/.test  ## speed beside the peers that are installed
 dist: $(VENV)/.test  ## the wheel and the source distribution, in dist/
 	$(PY) -m build --no-isolation
 
-# The three locks name every package, direct and indirect, that the target of that name installs. They hold for
-# Python 3.11 and newer on Linux, macOS and Windows. torch names its own accelerator packages, each at one
-# version, where pip finds a build that needs them; they are left out so that a build without them stays small.
+# The three locks name every package, direct and indirect, that the target of that name installs, resolved for
+# Python 3.11 and newer on every platform. The packages of an accelerator are left out: they come only with builds
+# of torch for it, at versions within the ranges that torch names.
 TORCH := 2.13.0
 UV := .venv-lock/bin/uv
 COMPILE = printf '%s\n' 'setuptools>=77' $(2) | $(UV) pip compile --quiet --upgrade --no-annotate --no-header \
