@@ -1,5 +1,6 @@
 """No warning and no progress bar of a library reaches the terminal, and nothing stays switched off after."""
 
+import os
 import subprocess
 import sys
 import warnings
@@ -56,6 +57,29 @@ def test_warnings_of_a_users_own_code_and_of_other_kinds_are_shown(module, categ
         with quiet():
             from_library(module, category)
     assert [str(x.message) for x in seen] == ["`old` is deprecated"]
+
+
+@pytest.mark.parametrize("off", [True, False])
+def test_the_bars_of_the_hub_are_as_they_were(off):
+    """transformers switches them together with its own; a user may have switched off the hub's only."""
+    from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
+
+    before = are_progress_bars_disabled()
+    (disable_progress_bars if off else enable_progress_bars)()
+    try:
+        with quiet():
+            assert are_progress_bars_disabled()
+        assert are_progress_bars_disabled() == off
+    finally:
+        (disable_progress_bars if before else enable_progress_bars)()
+
+
+def test_the_hubs_own_switch_brings_no_warning():
+    program = "from tightrope.language.quiet import quiet\nwith quiet():\n    pass\n"
+    environment = {**os.environ, "HF_HUB_DISABLE_PROGRESS_BARS": "0"}
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("bars", [True, False])

@@ -16,11 +16,15 @@ def quiet() -> Iterator[None]:
     Deprecations are for those who write code, so the libraries' are hidden. The filter comes last in the
     list: whatever a caller has asked for, ``-W error`` for one, comes before it. Also a decorator.
     """
+    from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars
     from transformers.utils import logging
 
-    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    level, bars, hub_bars_off = (
+        logging.get_verbosity(), logging.is_progress_bar_enabled(), are_progress_bars_disabled()
+    )  # fmt: skip
     logging.set_verbosity_error()
-    logging.disable_progress_bar()
+    with _no_warning_of_the_hub():
+        logging.disable_progress_bar()
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", category=FutureWarning, module=LIBRARIES, append=True)
@@ -28,4 +32,15 @@ def quiet() -> Iterator[None]:
     finally:
         logging.set_verbosity(level)
         if bars:
-            logging.enable_progress_bar()
+            with _no_warning_of_the_hub():
+                logging.enable_progress_bar()  # switches the hub's bars on too
+                if hub_bars_off:
+                    disable_progress_bars()
+
+
+@contextlib.contextmanager
+def _no_warning_of_the_hub() -> Iterator[None]:
+    """The hub warns when HF_HUB_DISABLE_PROGRESS_BARS decides and a call cannot."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Cannot (en|dis)able progress bars", category=UserWarning)
+        yield
