@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
+import functools
 import shlex
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from tightrope.cli.flags import Parser, UsageError
 from tightrope.cli.options import (
@@ -84,11 +83,8 @@ def align(words: list[str]) -> int:
     return _watched(run, display.ALIGN, "responses", given)
 
 
-def resume(given: dict[str, Any]) -> int:
-    """``tightrope resume RUN`` of a run of sft, reward or align: their settings tell them apart."""
-    from tightrope.runs.run import Run
-
-    settings = Run.open(given["run"]).settings
+def resume(given: dict[str, Any], settings: dict[str, Any]) -> int:
+    """``tightrope resume RUN`` of a run of sft, reward or align: its ``settings`` tell which."""
     for name in ("sft", "reward"):
         if OWN_FIELDS[name] in settings:
             return _resume_supervised(name, given)
@@ -219,33 +215,27 @@ def _given_again(run: str | None) -> list[str]:
 
 
 def _watched(run: Callable[[Any], dict[str, Any]], columns: Any, what: str, given: dict[str, Any]) -> int:
-    """Run with the right display; print the end."""
-    from tightrope.cli.display import Display, can_live
+    """Train with the display of language runs."""
+    from tightrope.cli.display import Display
+    from tightrope.cli.farewell import watched
 
-    as_json, quiet = bool(given.get("json")), bool(given.get("quiet"))
-    stream = sys.stderr if as_json else sys.stdout
-    live = not as_json and can_live(sys.stdout, dict(os.environ))
-    display = Display(columns, what, stream, quiet=quiet, live=live)
-    from tightrope.cli import farewell
-    from tightrope.runs import signals
+    return watched(
+        run,
+        functools.partial(Display, columns, what),
+        given,
+        what=what,
+        resume=lambda folder: shlex.join([PROGRAM, "resume", folder or "", *_given_again(folder)]),
+        print_end=functools.partial(_print_end, what),
+    )
 
-    try:
-        with signals.stoppable(), display:
-            summary = run(display)
-    except KeyboardInterrupt as error:
-        command = shlex.join([PROGRAM, "resume", display.run or "", *_given_again(display.run)])
-        print(farewell.farewell(error, display.run, display.step, what, command), file=sys.stderr)
-        return farewell.code_of(error)
-    if as_json:
-        print_json({**summary, "run_dir": display.run})
-        return 0
+
+def _print_end(what: str, summary: dict[str, Any], folder: str | None, quiet: bool, stream: TextIO) -> None:
+    """The final figures, where the run lies, and what to type next."""
     for name, value in (summary.get("final") or {}).items():
         if isinstance(value, int | float) and not quiet:
             print(f"{name:<32} {value:.4g}", file=stream)
-    print(f"run          {display.run}", file=stream)
-    if not quiet and display.run:
+    print(f"run          {folder}", file=stream)
+    if not quiet and folder:
         if what == "responses":
-            print(f"next         {shlex.join([PROGRAM, 'sample', display.run])}", file=stream)
-        model = Path(display.run) / "model"
-        print(f"model        {model}", file=stream)
-    return 0
+            print(f"next         {shlex.join([PROGRAM, 'sample', folder])}", file=stream)
+        print(f"model        {Path(folder) / 'model'}", file=stream)

@@ -50,10 +50,13 @@ def train(words: list[str]) -> int:
 def resume(words: list[str]) -> int:
     """``tightrope resume RUN``: go on from the newest checkpoint."""
     given = resume_parser().read(words)
-    if _is_language(given["run"]):
+    from tightrope.runs.run import Run
+
+    settings = Run.open(given["run"]).settings
+    if "env" not in settings:
         from tightrope.cli.language import resume as resume_language
 
-        return resume_language(given)
+        return resume_language(given, settings)
     _import_named(given.get("env_module"))
 
     def run(report: Any) -> dict[str, Any]:
@@ -63,13 +66,6 @@ def resume(words: list[str]) -> int:
         return run_training(given["run"], total_steps=total_steps, listeners=[report], env=env)
 
     return _watched(run, given)
-
-
-def _is_language(run: str) -> bool:
-    """Whether a run folder is one of the language story."""
-    from tightrope.runs.run import Run
-
-    return "env" not in Run.open(run).settings
 
 
 def evaluate(words: list[str]) -> int:
@@ -161,28 +157,20 @@ def _import_named(name: str | None) -> None:
 
 
 def _watched(run: Callable[[Any], dict[str, Any]], given: Options) -> int:
-    """Train with the right display; print the end; on SIGINT and SIGTERM the command that goes on."""
-    from tightrope.cli import display
+    """Train with the display of control runs."""
+    from tightrope.cli.display import choose
+    from tightrope.cli.farewell import watched
 
-    as_json, quiet = bool(given.get("json")), bool(given.get("quiet"))
-    stream = sys.stderr if as_json else sys.stdout
-    live = not as_json and display.can_live(sys.stdout, dict(os.environ))
-    report = display.choose(stream, quiet=quiet, live=live)
-    from tightrope.cli import farewell
-    from tightrope.runs import signals
-
-    try:
-        with signals.stoppable(), report:
-            summary = run(report)
-    except KeyboardInterrupt as error:
-        command = _command("resume", report.run or "", given)
-        print(farewell.farewell(error, report.run, report.step, "steps", command), file=sys.stderr)
-        return farewell.code_of(error)
-    if as_json:
-        print_json({**summary, "run_dir": report.run})
-    else:
-        _print_end(summary, report.run or "", given, quiet, stream)
-    return 0
+    return watched(
+        run,
+        choose,
+        given,
+        what="steps",
+        resume=lambda folder: _command("resume", folder or "", given),
+        print_end=lambda summary, folder, quiet, stream: _print_end(
+            summary, folder or "", given, quiet, stream
+        ),
+    )
 
 
 def _print_end(summary: dict[str, Any], run: str, given: Options, quiet: bool, stream: TextIO) -> None:

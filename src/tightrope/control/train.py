@@ -145,14 +145,6 @@ class AgentLearner:
         """How often the run went back to a checkpoint."""
         return self.agent.rollbacks
 
-    def settings_json(self) -> dict[str, Any]:
-        """The content of settings.json."""
-        return self.settings.to_json()
-
-    def changeable(self) -> Any:
-        """The settings of which some can be changed during the run: the update rule's."""
-        return self.settings.update
-
     def begin(self) -> list[str]:
         """Make the environments for evaluation; the lines that describe engine and environments."""
         self._begin = (self.position, self.seconds)

@@ -47,6 +47,11 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
+def figures(saved: dict[str, Any]) -> dict[str, float]:
+    """Numbers as they were before `plain` wrote them: null is NaN again."""
+    return {name: math.nan if x is None else float(x) for name, x in saved.items()}
+
+
 def dumps(value: Any, indent: int | None = None) -> str:
     """One JSON text without NaN literals; on a single line unless ``indent`` is given."""
     try:

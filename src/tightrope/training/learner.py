@@ -48,7 +48,7 @@ class Learner(Protocol):
 
     @property
     def settings(self) -> Any:
-        """The settings of the command."""
+        """The settings of the command, a `Settings`."""
 
     @property
     def rollbacks(self) -> int:
@@ -69,12 +69,6 @@ class Learner(Protocol):
     @property
     def merit(self) -> float | None:
         """How good the present state is: the best checkpoint is kept. None: not known."""
-
-    def settings_json(self) -> dict[str, Any]:
-        """The content of settings.json."""
-
-    def changeable(self) -> Any:
-        """The settings of which those in `CHANGEABLE` can be changed during the run."""
 
     def begin(self) -> list[str]:
         """Prepare for the first update; returns lines that describe the run."""
@@ -103,7 +97,7 @@ class Learner(Protocol):
 
 def change(learner: Learner, setting: str, value: Any) -> None:
     """Use another value of a setting from the next update on. ValueError for what cannot be changed."""
-    settings = learner.changeable()
+    settings = getattr(learner.settings, "update", learner.settings)  # the update rule's, where there is one
     names = [name for name in CHANGEABLE if hasattr(settings, name)]
     if setting not in names:
         raise ValueError(f"{setting!r} cannot change during a run; these can: {', '.join(names)}.")

@@ -23,7 +23,7 @@ def continue_from(learner: Learner, run: Run, point: Checkpoint | None) -> None:
     and settings.json holds the present settings.
     """
     run.rewind(point)
-    run.update_settings(learner.settings_json())
+    run.update_settings(learner.settings.to_json())
     restore_changes(learner, run)
 
 

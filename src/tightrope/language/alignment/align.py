@@ -67,16 +67,22 @@ def align(
     if (bias := bias_of(settings.kl)) is not None:
         told.warn(f"{bias}.")
     require_tensorboard(settings.tensorboard)
-    sources = (
+    with threads(settings.threads):
+        trainer = _trainer(settings, prompts, reward, gold, told)
+        name = f"align-{Path(settings.model).name}-{settings.seed}"
+        with Run.create(run_dir, trainer.settings.to_json(), name) as run:
+            return _train(trainer, run)
+
+
+def _trainer(settings: AlignSettings, prompts: Any, reward: Any, gold: Any, told: Listeners) -> Trainer:
+    """A trainer on what was given, and on what the settings name where nothing was."""
+    return Trainer(
+        settings,
         settings.data if prompts is None else prompts,
         settings.reward if reward is None else reward,
         settings.gold if gold is None else gold,
+        told,
     )
-    with threads(settings.threads):
-        trainer = Trainer(settings, *sources, told)
-        name = f"align-{Path(settings.model).name}-{settings.seed}"
-        with Run.create(run_dir, trainer.settings_json(), name) as run:
-            return _train(trainer, run)
 
 
 def _train(trainer: Trainer, run: Run) -> Aligned:
@@ -120,13 +126,8 @@ def resume_align(
         if total_episodes is not None:
             settings = settings.with_values(total_episodes=total_episodes)
         _require_what_no_file_gives(run_dir, settings, prompts, reward, gold)
-        sources = (
-            settings.data if prompts is None else prompts,
-            settings.reward if reward is None else reward,
-            settings.gold if gold is None else gold,
-        )
         with threads(settings.threads):
-            trainer = Trainer(settings, *sources, Listeners(listeners))
+            trainer = _trainer(settings, prompts, reward, gold, Listeners(listeners))
             _go_back(trainer, run, total_episodes)
             return _train(trainer, run)
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,7 +34,7 @@ from tightrope.language.data.examples import Prompt, hold_out_prompts, read_prom
 from tightrope.language.generation.sample import log_ratio_limit
 from tightrope.language.model.packaged import find_model
 from tightrope.language.model.parts import context_length
-from tightrope.language.model.saving import save_adapter, write_model
+from tightrope.language.model.saving import save_model
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.policy.rollout import Experience, FirstPass
@@ -52,8 +50,8 @@ from tightrope.language.reward.judge import (
 from tightrope.language.settings import AlignSettings
 from tightrope.maths.values import explained_variance
 from tightrope.runs.checkpoint import understood
-from tightrope.runs.durable import whole
 from tightrope.runs.history import Checkpoint
+from tightrope.runs.records import figures
 from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Update, crosses
@@ -137,14 +135,6 @@ class Trainer:
         """The newest gold score."""
         return self.monitor.newest_gold
 
-    def settings_json(self) -> dict[str, Any]:
-        """The content of settings.json."""
-        return self.settings.to_json()
-
-    def changeable(self) -> Any:
-        """The settings of which some can be changed during the run: the update rule's."""
-        return self.settings.update
-
     def begin(self) -> list[str]:
         """The lines that describe the models."""
         return self.roles.lines()
@@ -161,7 +151,8 @@ class Trainer:
 
     def finish(self, run: Run) -> dict[str, Any]:
         """Write the model; returns the summary."""
-        save_model(self.roles, run.path, self.settings)
+        roles, source = self.roles, find_model(self.settings.model)
+        save_model(roles.model, roles.tokenizer, run.path, roles.policy.adapter, source)
         rows = run.read_metrics()
         if rows and not any("train/minibatches" in row for row in rows):
             self.listeners.warn(
@@ -249,7 +240,7 @@ class Trainer:
             self.monitor.restore(state["monitor"])
             self.stopped = bool(state["stopped"])
             self.seconds = float(state["seconds"])
-            self.newest = {k: math.nan if x is None else float(x) for k, x in state["newest"].items()}
+            self.newest = figures(state["newest"])
             if self.pretraining is not None:
                 self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 
@@ -421,14 +412,3 @@ class Trainer:
         judged = np.concatenate(found)
         mean = float(judged.mean()) if len(judged) else float("nan")
         return {"eval/gold": mean, "eval/gold_masked": float(len(self.held_out) - len(judged))}
-
-
-def save_model(roles: Roles, path: Path, settings: AlignSettings) -> None:
-    """RUN/model for AutoModelForCausalLM.from_pretrained, tokenizer and chat template included; with LoRA the
-    adapter is folded in, and lies in RUN/adapter for PEFT as well.
-    """
-    name = "policy" if settings.tune == "lora" else None
-    write_model(roles.model, roles.tokenizer, path / "model", name)
-    if name is not None:
-        with whole(path / "adapter") as folder:
-            save_adapter(roles.model, name, folder, base_model=find_model(settings.model))

@@ -65,6 +65,16 @@ def load_adapter(model: Any, name: str, folder: Path) -> None:
     load_adapter_state(model, name, state)
 
 
+def save_model(model: Any, tokenizer: Any, run: Path, adapter: str | None, base_model: str) -> None:
+    """RUN/model for AutoModelForCausalLM.from_pretrained, tokenizer and chat template included. An adapter is
+    folded in, and lies in RUN/adapter for PEFT as well; ``base_model`` is what it belongs to.
+    """
+    write_model(model, tokenizer, run / "model", adapter)
+    if adapter is not None:
+        with whole(run / "adapter") as folder:
+            save_adapter(model, adapter, folder, base_model=base_model)
+
+
 def write_model(model: Any, tokenizer: Any, folder: Path, adapter: str | None) -> None:
     """Any transformers model with one adapter folded in, and its tokenizer, as safetensors; whole or absent.
     Raises CannotWrite.

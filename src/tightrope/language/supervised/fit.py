@@ -24,6 +24,7 @@ from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.history import Checkpoint
+from tightrope.runs.records import figures
 from tightrope.runs.run import Run
 from tightrope.settings.fields import scheduled
 from tightrope.training.learner import Update, crosses
@@ -99,14 +100,6 @@ class SupervisedLearner:
         loss = self.newest.get("sft/held_out_loss")
         return self.newest.get("reward/held_out_accuracy") if loss is None else -loss
 
-    def settings_json(self) -> dict[str, Any]:
-        """The content of settings.json."""
-        return self.settings.to_json()
-
-    def changeable(self) -> SupervisedSettings:
-        """The settings of which some can be changed during the run."""
-        return self.settings
-
     def begin(self) -> list[str]:
         """The lines that describe model and data."""
         return self.lines
@@ -169,7 +162,7 @@ class SupervisedLearner:
         items = len(self.objective.items)
         with understood(folder):
             step, before = int(state["step"]), state["items"]
-            newest = {name: math.nan if x is None else float(x) for name, x in state["newest"].items()}
+            newest = figures(state["newest"])
             if before == items:
                 put_back(tensors, self.parameters, self.optimiser)
             self.step = step

@@ -82,7 +82,7 @@ def train_supervised(
     else:
         require_tensorboard(settings.tensorboard)
         name = f"{objective.name}-{Path(settings.model).name.strip('<>')}-{settings.seed}"
-        run = Run.create(place, learner.settings_json(), name)
+        run = Run.create(place, settings.to_json(), name)
     with run:
         point = newest_point(run, listeners)
         if point is not None:

@@ -17,13 +17,12 @@ from tightrope.language.data.examples import Row, hold_out, read_rows, sft_examp
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.model import lora
 from tightrope.language.model.parts import attention_window, parts
-from tightrope.language.model.saving import save_adapter, write_model
+from tightrope.language.model.saving import save_model
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, micro_batches
 from tightrope.language.supervised.prepare import Loaded, precision, prepared, training_rows
 from tightrope.language.supervised.run import recorded, reopened, train_supervised
-from tightrope.runs.durable import whole
 from tightrope.training.events import Listener, Listeners
 
 PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
@@ -151,10 +150,7 @@ def _train(
     learnt = sum(_learnt(row) for row in rows)
 
     def save(folder: Path, newest: dict[str, float]) -> dict[str, Any]:
-        write_model(model, loaded.tokenizer, folder / "model", loaded.adapter)
-        if loaded.adapter is not None:
-            with whole(folder / "adapter") as inner:
-                save_adapter(model, loaded.adapter, inner, base_model=loaded.source)
+        save_model(model, loaded.tokenizer, folder, loaded.adapter, loaded.source)
         return {"rows": len(rows), "held_out_rows": len(held), "tokens": learnt}
 
     parameters = list(model.parameters())
