@@ -23,7 +23,7 @@ assert len(sample_run(run.path)) == 2
 
 
 def test_align_in_python_prints_nothing_of_its_libraries(tmp_path):
-    """A program of a user's own, under Python's own filters: nobody has asked for silence."""
+    """A user's program, under Python's default filters."""
     program = PROGRAM.format(model=saved(tmp_path / "model", tiny_llama()))
     command = [sys.executable, "-c", program]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)

@@ -1,4 +1,4 @@
-"""What a run folder still gives: loaded, evaluated, used and gone on with, as numbers and tensors.
+"""What a run folder still gives: loaded, evaluated, used and resumed, as numbers and tensors.
 
 `write.py` records this with the code of a day, `test_old_runs.py` asks for it again with the code of today.
 Paths in the runs are relative: whoever calls stands in a copy of the folder of that day.
@@ -194,7 +194,7 @@ def end_of(name: str) -> Outcome:
 
 
 def resumed(name: str) -> Outcome:
-    """The run as it was when it was killed, gone on with to its end, as its user would."""
+    """The killed run, resumed to its end as its user would."""
     if ENVIRONMENTS.get(name) is not None:
         train.resume(name, env=ENVIRONMENTS[name])
     elif code := main(["resume", name, "--quiet"]):

@@ -9,7 +9,7 @@ Bits depend on the libraries and on the processor. Where both are as recorded, e
 bit; elsewhere floats may differ by a tolerance, and nothing else may. The name of a test says which of the
 two it was, its message why. Nothing is ever skipped.
 
-A change that makes these tests fail and is meant: say in the changelog what it does to old runs, record anew
+A change that makes these tests fail and is meant: say in the changelog what it does to old runs, record again
 what the old folders give (`write.py FOLDER --expected`), and write a new folder beside them. The run folders
 themselves are never written again.
 """

@@ -9,13 +9,13 @@ A new one, with the code of today, beside the old ones:
 
     PYTHONPATH=src:tests python tests/old_runs/write.py tests/old_runs/YYYY-MM-DD
 
-``--expected`` leaves the runs as they are, which are never written again, and records anew what they give:
+``--expected`` leaves the runs as they are, which are never written again, and records again what they give:
 for a change that means to change it. What was used (Python, libraries, processor) stands in
 expected/machine.json.
 
 Runs that end in ``-killed``, and those of the control story, are as SIGKILL left them behind a checkpoint:
 rows that no checkpoint counts on, the note of a writer that is gone. sft, reward and align came to their end.
-Before anything is recorded, each killed run is gone on with and compared to the bit with one without a break.
+Before anything is recorded, each killed run is resumed and compared, to the bit, with an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ def main() -> None:
     """Read the words, and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", nargs="?", type=Path, help="the folder of the day")
-    parser.add_argument("--expected", action="store_true", help="leave the runs, record anew what they give")
+    parser.add_argument("--expected", action="store_true", help="leave the runs, record again what they give")
     parser.add_argument("--die", nargs=3, metavar=("NAME", "RUN", "STEP"), help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.die:

@@ -45,7 +45,7 @@ def test_settings_are_there_before_the_first_step(tmp_path: Path) -> None:
 
 
 def test_a_changed_digit_of_the_settings_is_found(tmp_path: Path) -> None:
-    """Readers may look at them; whoever goes on with the run may not."""
+    """Readers may look at them; a caller that resumes the run may not."""
     run = Run.create(tmp_path / "a", {"clip": 0.25, "steps": 3000, "lr": 1e-3}, "name")
     file = run.path / "settings.json"
     text, found = file.read_text(), 0
