@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import tomllib
 
 import pytest
-from source_tree import ROOT, SRC, name_of, sources, tree
+from source_tree import ROOT, SRC, module_of, name_of, sources, tree
 
 import tightrope
 
@@ -48,6 +49,36 @@ def test_every_public_name_is_there():
         assert getattr(tightrope, name) is not None
     with pytest.raises(AttributeError, match="it has A2C"):
         tightrope.Nothing  # noqa: B018 - to ask for it is the test
+
+
+# no errors: they end a run or a call from outside, and `except Exception` must not catch them
+STOP_SIGNALS = {"tightrope.runs.signals.Stopped", "tightrope.control.environments.faults.Overdue"}
+
+
+def exceptions() -> dict[str, type[BaseException]]:
+    """Every exception class of the package by its full name."""
+    found = {}
+    for path in sources():
+        names = [node.name for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef) and node.bases]
+        module = importlib.import_module(module_of(path)) if names and path.stem != "__main__" else None
+        for name in names:
+            kind = getattr(module, name, None)
+            if isinstance(kind, type) and issubclass(kind, BaseException):
+                found[f"{kind.__module__}.{name}"] = kind
+    return found
+
+
+def test_every_exception_has_the_one_base():
+    """errors.py names each of them; stop signals are no errors."""
+    found = exceptions()
+    outside = {name for name, kind in found.items() if not issubclass(kind, tightrope.TightropeError)}
+    assert outside == STOP_SIGNALS
+    assert not any(issubclass(found[name], Exception) for name in STOP_SIGNALS)
+    drawn = tightrope.errors.__doc__
+    for name, kind in found.items():
+        assert kind.__name__ in drawn, name
+        other = kind.__bases__[1].__name__ if len(kind.__bases__) > 1 else kind.__name__
+        assert other in drawn, f"{name} inherits {other}"
 
 
 def test_version_is_the_same_everywhere():

@@ -34,8 +34,8 @@ def test_a_signal_stops_at_once_and_says_its_exit_code(number, code):
 
 def test_a_save_is_finished_first():
     steps = []
-    with pytest.raises(signals.Stopped), signals.stoppable(), signals.whole():
-        with signals.whole():
+    with pytest.raises(signals.Stopped), signals.stoppable(), signals.uninterrupted():
+        with signals.uninterrupted():
             os.kill(os.getpid(), signal.SIGTERM)
             steps.append("inner")
         steps.append("outer")
@@ -43,7 +43,7 @@ def test_a_save_is_finished_first():
 
 
 def test_a_second_signal_does_not_wait():
-    with pytest.raises(signals.Stopped) as caught, signals.stoppable(), signals.whole():
+    with pytest.raises(signals.Stopped) as caught, signals.stoppable(), signals.uninterrupted():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGINT)
         pytest.fail("it went on")
@@ -54,8 +54,8 @@ def test_what_swallows_a_signal_is_stopped_at_the_next_update():
     with pytest.raises(signals.Stopped), signals.stoppable():
         with contextlib.suppress(BaseException):  # as a reward function may
             os.kill(os.getpid(), signal.SIGINT)
-        signals.check()
-    signals.check()  # outside, and later, nothing is left of it
+        signals.raise_if_stopped()
+    signals.raise_if_stopped()  # outside, and later, nothing is left of it
 
 
 def test_before_a_run_and_without_a_checkpoint(tmp_path):

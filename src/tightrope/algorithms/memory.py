@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms.batch import Batch
+from tightrope.errors import TightropeError
 
 SIGNS = ("out of memory", "not enough memory", "defaultcpuallocator")  # what torch's RuntimeErrors say
 
 
-class OutOfMemory(RuntimeError):
+class OutOfMemory(TightropeError, RuntimeError):
     """Memory is not enough even for the smallest part; the message says which setting makes it smaller."""
 
 

@@ -13,10 +13,11 @@ from torch import Tensor, nn
 
 from tightrope.algorithms.nonfinite import REFUSED, NonFiniteError
 from tightrope.algorithms.settings import UpdateSettings
+from tightrope.errors import TightropeError
 from tightrope.maths import divergence, statistics, surrogate
 
 
-class SamplingMismatch(RuntimeError):
+class SamplingMismatch(TightropeError, RuntimeError):
     """The probabilities that trained are not the probabilities that sampled."""
 
 

@@ -68,7 +68,7 @@ def farewell(error: BaseException, run: str | None, step: int, what: str, comman
 
 def newest(run: str) -> Path | None:
     """The folder of a run's newest valid checkpoint; None where there is none."""
-    from tightrope.runs.run import Run  # which has its saves wrapped in `whole`
+    from tightrope.runs.run import Run  # which has its saves wrapped in `uninterrupted`
 
     try:
         return Run.open(run).newest().folder

@@ -7,13 +7,14 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
+from tightrope.errors import TightropeError
 from tightrope.settings.fields import kinds, range_text
 from tightrope.settings.peer_names import PEER_NAMES
 
 WIDTH = 100
 
 
-class UsageError(ValueError):
+class UsageError(TightropeError, ValueError):
     """The command line is wrong; the message says how, and what was probably meant."""
 
 
@@ -167,7 +168,7 @@ def reader(kind: type, optional: bool, choices: tuple[str, ...]) -> Callable[[st
             )
         try:
             if kind is int:
-                return whole(word)
+                return whole_number(word)
             return kind(word)
         except ValueError:
             expected = {int: "a whole number", float: "a number"}[kind] + (" or none" if optional else "")
@@ -179,13 +180,13 @@ def reader(kind: type, optional: bool, choices: tuple[str, ...]) -> Callable[[st
 def width(word: str) -> int:
     """One entry of a list of whole numbers. The error explains that the task comes before the list."""
     try:
-        return whole(word)
+        return whole_number(word)
     except ValueError:
         text = f"{word!r} is not a whole number. Give the task before this list: train ENV --hidden 64 64"
         raise argparse.ArgumentTypeError(text) from None
 
 
-def whole(word: str) -> int:
+def whole_number(word: str) -> int:
     """A whole number, also as 100_000 or 1e6. Raises ValueError."""
     try:
         return int(word)

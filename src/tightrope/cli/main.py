@@ -21,6 +21,7 @@ from tightrope.cli.options import (
     resume_parser,
     training_options,
 )
+from tightrope.errors import TightropeError
 from tightrope.runs.records import printable
 
 # ---------------------------------------------------------------------------- commands
@@ -252,7 +253,11 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether an error was raised by this package's own code: worded for the user, no traceback needed."""
+    """Whether the message is worded for the user, so that no traceback is needed: an error class of ours, or
+    another one that our own code raised (a ValueError about a setting).
+    """
+    if isinstance(error, TightropeError | OSError):
+        return True
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -278,12 +283,12 @@ def main(words: list[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return _dispatch(words)
-    except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
+    except (TightropeError, ValueError, OSError, RuntimeError, FloatingPointError) as error:
         if isinstance(error, BrokenPipeError):
             # whoever read our output is gone; Python must not try to flush to it on its way out
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
-        if not isinstance(error, OSError) and not _is_ours(error):
+        if not _is_ours(error):
             raise
         print(f"{PROGRAM}: {printable(str(error))}", file=sys.stderr)
         return 2

@@ -16,7 +16,7 @@ from tightrope.cli.flags import (
     settings_fields,
     suggestion,
     unknown_flag,
-    whole,
+    whole_number,
     with_dashes,
 )
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
@@ -251,7 +251,7 @@ def _not_negative(word: str) -> int:
 
 def _bounded(word: str, low: int) -> int:
     try:
-        number = whole(word)
+        number = whole_number(word)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{word!r} is not a whole number.") from None
     if number < low:

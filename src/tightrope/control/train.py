@@ -205,7 +205,7 @@ class AgentLearner:
     def _keep(self, mean: float) -> None:
         """Save the policy as the best; where the disk refuses, the best one is still the one before."""
         try:
-            with signals.whole():
+            with signals.uninterrupted():
                 self.agent.save(self.run.best)
         except CannotWrite as error:
             self.listeners.warn(

@@ -16,16 +16,18 @@ import re
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from tightrope.runs import tensors as safetensors_file
+from tightrope.errors import TightropeError
 from tightrope.runs import versions
-from tightrope.runs.durable import present, whole, write_file
+from tightrope.runs.durable import atomic_folder, present, write_file
 from tightrope.runs.records import canonical, dumps, read_json
+from tightrope.runs.tensors import safetensors_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+_T = TypeVar("_T")
 FORMAT = "tightrope-checkpoint"
 VERSION = 2
 READS = 5  # of a folder that is replaced while it is read
@@ -34,7 +36,7 @@ _STEP_FOLDER = re.compile(r"step-(\d{12})")
 _ADVICE = "The checkpoint is damaged or was changed: use another one, or train again."
 
 
-class CheckpointError(ValueError):
+class CheckpointError(TightropeError, ValueError):
     """A checkpoint that cannot be trusted or found; the message names the file and what to do."""
 
 
@@ -69,9 +71,9 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
             raise CheckpointError(
                 f"{stem!r} is no file stem for a checkpoint. Use letters, digits, '-' and '_'."
             )
-    with whole(folder) as temporary:
+    with atomic_folder(folder) as temporary:
         parts: dict[str, Any] = {"state.json": [(dumps(state, indent=2) + "\n").encode("utf-8")]}
-        parts |= {f"{stem}.safetensors": safetensors_file.content(group) for stem, group in tensors.items()}
+        parts |= {f"{stem}.safetensors": safetensors_bytes(group) for stem, group in tensors.items()}
         files = {}
         for name, content in parts.items():
             size, digest = write_file(temporary / name, content, sync=False)
@@ -82,7 +84,7 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
             "step": step_of(folder) if step_of(folder) >= 0 else None,
             "files": files,
             "versions": versions.known(),
-            "settings_sha256": fingerprint(state["settings"]) if "settings" in state else None,
+            "settings_sha256": json_sha256(state["settings"]) if "settings" in state else None,
         }
         write_file(temporary / "manifest.json", [_manifest_text(manifest)], sync=False)
     return folder
@@ -91,10 +93,10 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
 def _manifest_text(manifest: dict[str, Any]) -> bytes:
     """The one text of a manifest, the hash of its content in it."""
     bare = {name: value for name, value in manifest.items() if name != "sha256"}
-    return (dumps({**bare, "sha256": fingerprint(bare)}, indent=2) + "\n").encode("utf-8")
+    return (dumps({**bare, "sha256": json_sha256(bare)}, indent=2) + "\n").encode("utf-8")
 
 
-def fingerprint(value: Any) -> str:
+def json_sha256(value: Any) -> str:
     """The SHA-256 of the canonical JSON of a value."""
     return hashlib.sha256(canonical(value)).hexdigest()
 
@@ -190,7 +192,7 @@ def understood(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _steadily(folder: Path, read: Callable[[Path], Any]) -> Any:
+def _steadily(folder: Path, read: Callable[[Path], _T]) -> _T:
     """What ``read`` gives of a folder, tried again as long as another folder has taken its place."""
     for left in reversed(range(READS)):
         before = _identity(folder)

@@ -16,6 +16,8 @@ import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from tightrope.errors import TightropeError
+
 TEMPORARY = ".saving-"
 ASIDE = ".replaced-"
 PRUNED = ".pruned-"
@@ -32,7 +34,7 @@ _ADVICE = {
 }
 
 
-class CannotWrite(OSError):
+class CannotWrite(TightropeError, OSError):
     """Something that could not be written: the path, why, and what to do. What was there before is whole."""
 
     def __init__(self, path: Path, cause: BaseException) -> None:
@@ -104,7 +106,7 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 @contextlib.contextmanager
-def whole(folder: Path) -> Iterator[Path]:
+def atomic_folder(folder: Path) -> Iterator[Path]:
     """A new folder to fill; on leaving it takes the place of ``folder``, whole and durable.
 
     Files in it are made durable when all are written: the first fsync then carries most of the others.

@@ -18,6 +18,7 @@ import weakref
 from pathlib import Path
 from typing import Any
 
+from tightrope.errors import TightropeError
 from tightrope.runs.durable import write_all, writing
 
 NAME = "writer.lock"
@@ -25,7 +26,7 @@ _HELD: weakref.WeakSet[WriterLock] = weakref.WeakSet()
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
-class RunInUse(RuntimeError):
+class RunInUse(TightropeError, RuntimeError):
     """Another process, or another place in this one, is writing this run; the message names it."""
 
 

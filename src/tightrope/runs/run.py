@@ -188,7 +188,7 @@ class Run:
         then CannotWrite is raised. ``settings``, ``records`` and ``merit`` are added to ``state``. A signal
         waits for the end.
         """
-        with signals.whole():
+        with signals.uninterrupted():
             self._save(step, tensors, state, keep=keep, say=say, merit=merit, final=final)
 
     def _save(
@@ -255,7 +255,7 @@ class Run:
         self._put_aside_a_damaged_best(say)
         point = history.valid(self.checkpoints, lambda text: say(f"warning: {text}"), self._check_records)
         manifest = checkpoint.read_manifest(durable.present(point.folder))
-        if changed := versions.differences(manifest.get("versions")):
+        if changed := versions.version_changes(manifest.get("versions")):
             say(f"warning: {changed} since the checkpoint: the run goes on, but its last bits may differ.")
         return point
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from tightrope.runs.checkpoint import fingerprint
+from tightrope.runs.checkpoint import json_sha256
 from tightrope.runs.records import read_json
 
 KEY = "sha256"
@@ -13,7 +13,7 @@ KEY = "sha256"
 
 def signed(settings: dict[str, Any]) -> dict[str, Any]:
     """The settings and their hash."""
-    return {**settings, KEY: fingerprint(settings)}
+    return {**settings, KEY: json_sha256(settings)}
 
 
 def unsigned(found: dict[str, Any]) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def unsigned(found: dict[str, Any]) -> dict[str, Any]:
 
 def require_own(file: Path, found: dict[str, Any]) -> None:
     """ValueError when what was read from ``file`` is not as it was signed; what bears no hash is let pass."""
-    if KEY in found and found[KEY] != fingerprint(unsigned(found)):
+    if KEY in found and found[KEY] != json_sha256(unsigned(found)):
         raise ValueError(
             f"{file} is not as the run wrote it: its sha256 is that of other settings, and the end would be "
             f"another run's. Put it back, or begin a new run of these settings: --settings {file}"

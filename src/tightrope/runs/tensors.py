@@ -31,7 +31,7 @@ _NAMES = {
 }
 
 
-def content(tensors: dict[str, Tensor]) -> Iterator[bytes | memoryview]:
+def safetensors_bytes(tensors: dict[str, Tensor]) -> Iterator[bytes | memoryview]:
     """The bytes of a safetensors file of these tensors. ValueError for a dtype that it cannot hold."""
     import torch
 

@@ -6,7 +6,7 @@ import platform
 import sys
 from typing import Any
 
-LIBRARIES = ("torch", "numpy", "numba", "gymnasium", "transformers")
+VERSIONED = ("torch", "numpy", "numba", "gymnasium", "transformers")
 
 
 def known() -> dict[str, str]:
@@ -22,10 +22,10 @@ def known() -> dict[str, str]:
         import torch
 
         found["processor"] += f" {torch.backends.cpu.get_cpu_capability()}"
-    return found | {name: str(sys.modules[name].__version__) for name in LIBRARIES if name in sys.modules}
+    return found | {name: str(sys.modules[name].__version__) for name in VERSIONED if name in sys.modules}
 
 
-def differences(saved: Any) -> str:
+def version_changes(saved: Any) -> str:
     """What has changed since ``saved``, an earlier answer of `known`, in words; empty when nothing has."""
     saved, now = saved if isinstance(saved, dict) else {}, known()
     changed = [name for name in now if name in saved and saved[name] != now[name]]

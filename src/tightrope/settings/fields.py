@@ -98,7 +98,7 @@ def typed(name: str, value: Any, kind: Kind) -> Any:
     raise ValueError(f"{name} is {value!r} ({type(value).__name__}); expected {kind}.")
 
 
-def check(settings: Any) -> None:
+def validate(settings: Any) -> None:
     """Raise ValueError naming the first field of a wrong kind or outside its declared range."""
     kind: type = type(settings)
     for field in dataclasses.fields(settings):

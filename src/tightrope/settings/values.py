@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from tightrope.settings.fields import check, kinds, typed
+from tightrope.settings.fields import kinds, typed, validate
 from tightrope.settings.peer_names import PEER_NAMES
 
 
@@ -20,7 +20,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Check every field: its kind, its range, and the class of ``update``."""
-        check(self)
+        validate(self)
         rule = rule_of(type(self), getattr(self, "algorithm", None))
         update = getattr(self, "update", None)
         if rule is not None and not isinstance(update, rule):

@@ -35,7 +35,7 @@ class _Loop:
             self._start()
             stop = self._requests()
             for update in () if stop else self._updates():
-                signals.check()
+                signals.raise_if_stopped()
                 self._record(update)
                 # before the save, so that a resumed run knows what was changed at its checkpoint
                 if self._requests():

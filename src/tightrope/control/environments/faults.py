@@ -16,12 +16,14 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from tightrope.errors import TightropeError
+
 FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
 LONGEST_PAUSE = 2.0
 Result = TypeVar("Result")
 
 
-class EnvironmentFault(RuntimeError):
+class EnvironmentFault(TightropeError, RuntimeError):
     """An environment raised, hung or broke Gymnasium's API, or its process died.
 
     ``index``: which environment (-1: unknown). ``step``: since all were reset. ``worker``: its process (0:
@@ -56,7 +58,7 @@ class EnvironmentFault(RuntimeError):
         return {"message": str(self), **{name: getattr(self, name) for name in names}}
 
 
-class ApiBreak(Exception):
+class ApiBreak(TightropeError):
     """An environment returned what Gymnasium's API does not allow; becomes an EnvironmentFault.
 
     ``index``: the row of a vector environment that did (-1: all, or unknown).

@@ -10,11 +10,12 @@ from tightrope.control.engine.base import Acted
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import action_text, circumstances
 from tightrope.control.spaces import Inputs
+from tightrope.errors import TightropeError
 
 Array = np.ndarray
 
 
-class BadNumbers(ValueError):
+class BadNumbers(TightropeError, ValueError):
     """An environment returned a NaN or an infinity; nothing was learned from it."""
 
 

@@ -55,7 +55,7 @@ from tightrope.runs.records import figures
 from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Update, crosses
-from tightrope.training.parameters import Tensors, put_back, tensors_of
+from tightrope.training.parameters import Tensors, restore_tensors, tensors_of
 
 
 class Trainer:
@@ -229,7 +229,7 @@ class Trainer:
                 "the run began with, or begin a new run."
             )
         with understood(folder):
-            put_back(tensors, self.roles.parameters(), self.optimiser)
+            restore_tensors(tensors, self.roles.parameters(), self.optimiser)
             self.episodes = int(state["episodes"])
             self.iteration = int(state["iteration"])
             self.kl_beta = float(state["kl_beta"])

@@ -25,6 +25,8 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from tightrope.errors import TightropeError
+
 T = TypeVar("T")
 Text = str | list[dict[str, Any]]
 RewardFunction = Callable[..., Any]
@@ -32,7 +34,7 @@ FaultKind = Literal["exception", "length", "type", "not finite", "timeout", "non
 LARGEST = 1e30  # above it a score, or a sum of weighted ones, would be infinite in float32
 
 
-class RewardError(ValueError):
+class RewardError(TightropeError, ValueError):
     """A reward function cannot be used as it is; the message names it and what to do."""
 
 
@@ -49,7 +51,7 @@ class Fault:
     text: str
 
 
-class NoScores(Exception):
+class NoScores(TightropeError):
     """What a function returned is no list of scores; the message follows the function's name."""
 
     def __init__(self, kind: FaultKind, text: str) -> None:
@@ -268,7 +270,7 @@ def _message_copied(part: Any) -> Any:
     return dict(part) if type(part) is dict else part
 
 
-class Overdue(Exception):
+class Overdue(TightropeError):
     """A call was not back at its deadline."""
 
 
