@@ -27,7 +27,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = ("src", "setup.py", "pyproject.toml", "README.md", "LICENSE")
+SOURCES = ("src", "setup.py", "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in")
 
 
 def run(command: list[str | Path], where: Path) -> str:
@@ -103,6 +103,7 @@ def test_wheel_and_source_hold_the_package_whole(built: Path):
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         packed = {name.partition("/")[2] for name in archive.getnames()}
     assert {f"src/{name}" for name in sources} | {*SOURCES[1:]} <= packed
+    assert not [name for name in packed if name.startswith("tests/")]  # some of them would be worse than none
 
 
 def test_the_index_page_shows_no_link_that_only_works_in_the_repository(built: Path):
@@ -146,7 +147,7 @@ OF_THE_USER = {"datasets"}  # a hub data set: the message that it is missing nam
 
 
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
-    """Each third party has its line in pyproject.toml: the core's for core files, an extra's elsewhere too."""
+    """Each third party has its line in pyproject.toml: the core's for core files, or an extra's."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     core = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
     extras = project["optional-dependencies"]
