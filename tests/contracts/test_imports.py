@@ -37,7 +37,7 @@ MAY_IMPORT = {
     | {"training"}
     | {f"control.{part}" for part in ("spaces", "environments", "policy", "engine", "rollout")},
     "language.data": CORE,
-    "language.model": CORE | {"language.data"},
+    "language.model": CORE | {"language.data", "language.quiet"},
     "language.generation": CORE | {"language.data", "language.model"},
     "language.memory": CORE | {"language.model", "language.generation", "language.settings"},
     "language.policy": CORE

@@ -85,6 +85,27 @@ def test_every_install_of_the_readme_commands_takes_its_lock():
     assert not [line for line in lines if "--editable" in line and "--no-build-isolation" not in line]
 
 
+def test_every_pip_command_of_the_readme_takes_a_lock_that_names_what_it_installs():
+    lines = re.findall(r"^pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert len(lines) == 4
+    for line in lines:
+        lock = re.search(r"--constraint locks/([\w-]+)\.txt", line)
+        assert lock, f"pip install {line}: another version next year"
+        names = line.partition("#")[0].replace(lock[0], "").split()
+        named = {canonicalize_name(word) for word in names if re.fullmatch(r"[a-z][\w-]*", word)}
+        assert named <= set(locked_here(lock[1]))
+
+
+def test_packages_that_are_installed_without_their_dependencies_have_one_version_everywhere():
+    """The message for a model that is missing names the version that the Makefile takes."""
+    from tightrope.language.model import packaged
+
+    made = " ".join(re.findall(r"^(?:MODEL|REVIEWS|SMOLLM2) := (.*)$", MAKEFILE, re.MULTILINE)).split()
+    assert len(made) == 4
+    assert set(made) <= set(pins("demo-language"))
+    assert {word for word in packaged.ADVICE.split() if "==" in word} <= set(made)
+
+
 def test_ranges_are_open_and_the_oldest_lock_holds_their_lower_ends():
     oldest = locked_here("oldest")
     for requirement in ranges():

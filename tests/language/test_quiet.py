@@ -12,6 +12,11 @@ from tightrope.language.quiet import quiet
 
 PROGRAM = """
 from tightrope.language import align, sample_run
+from tightrope.language.alignment.align import resume_align
+from tightrope.language.model.packaged import find_model
+from tightrope.language.settings import RewardSettings, SFTSettings
+from tightrope.language.supervised.preferences import resume_reward, train_reward
+from tightrope.language.supervised.sft import resume_sft, train_sft
 
 def reward(prompts, completions, **columns):
     return [float(len(c)) for c in completions]
@@ -19,14 +24,26 @@ def reward(prompts, completions, **columns):
 small = dict(total_episodes=8, batch_size=8, minibatch_size=8, max_new_tokens=4, max_prompt_tokens=8)
 run = align(model={model!r}, prompts=["ab", "ba"], reward=reward, seed=1, run_dir="run", **small)
 assert len(sample_run(run.path)) == 2
+resume_align(run.path, prompts=["ab", "ba"], reward=reward)
+
+assert find_model("glassllm").startswith("cache")  # unpacked here
+
+few = dict(model={model!r}, num_epochs=1, minibatch_size=2, max_tokens=16, lora_rank=2)
+texts = [{{"prompt": "ab", "completion": "cd"}}] * 4
+train_sft(SFTSettings(**few), data=texts, run_dir="sft")
+resume_sft("sft", data=texts)
+pairs = [{{"prompt": "ab", "chosen": "cd", "rejected": "e"}}] * 4
+train_reward(RewardSettings(**few), data=pairs, run_dir="reward")
+resume_reward("reward", data=pairs)
 """
 
 
-def test_align_in_python_prints_nothing_of_its_libraries(tmp_path):
+def test_the_three_stages_in_python_print_nothing_of_their_libraries(tmp_path):
     """A user's program, under Python's default filters."""
     program = PROGRAM.format(model=saved(tmp_path / "model", tiny_llama()))
     command = [sys.executable, "-c", program]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    fresh = {**os.environ, "XDG_CACHE_HOME": "cache"}
+    ended = subprocess.run(command, cwd=tmp_path, env=fresh, capture_output=True, text=True, timeout=300)
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
 
 

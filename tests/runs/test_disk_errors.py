@@ -18,7 +18,7 @@ from tightrope.runs import checkpoint
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.run import Run
 
-KEEP = {"keep": 2, "say": lambda text: None}
+KEEP = {"keep": 2, "warn": lambda text: None}
 
 
 def tensors(step: int, size: int = 600) -> dict[str, dict[str, torch.Tensor]]:
@@ -42,7 +42,7 @@ def check(run: Run, newest: int) -> None:
     """The run goes on from ``newest``, with every row up to it, none twice, and nothing half-written."""
     run.close()
     with Run.open(run.path) as again:
-        point = again.resume_point(lambda text: pytest.fail(text))
+        point = again.resume_point(pytest.fail, pytest.fail)
         assert point.state["step"] == newest
         assert torch.equal(point.tensors["policy"]["w"], tensors(newest)["policy"]["w"])
         again.rewind(point)
@@ -130,10 +130,10 @@ def test_a_small_disk_that_is_filled_by_a_save(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk") as reason:
         run = begun(tmp_path / "disk" / "run")
         update(run, 30)
-        run.save(30, tensors(30, 50_000), {"step": 30}, keep=2, say=told.append)
+        run.save(30, tensors(30, 50_000), {"step": 30}, keep=2, warn=told.append)
         assert len(told) == 1 and reason in told[0] and "step-000000000030 cannot be written" in told[0]
         with pytest.raises(CannotWrite, match=reason):
-            run.save(30, tensors(30, 50_000), {"step": 30}, keep=2, say=told.append, final=True)
+            run.save(30, tensors(30, 50_000), {"step": 30}, keep=2, warn=told.append, final=True)
         check(run, 20)
 
 
@@ -158,7 +158,7 @@ def test_a_folder_that_may_no_longer_be_written(
         patch.setattr(os, "open", reading)
         for name in ("mkdir", "rename", "replace", "unlink", "rmdir"):
             patch.setattr(os, name, refuse)
-        run.save(30, tensors(30), {"step": 30}, keep=2, say=told.append)
+        run.save(30, tensors(30), {"step": 30}, keep=2, warn=told.append)
         assert len(told) == 1 and advice in told[0] and os.strerror(number) in told[0]
         for write in (
             lambda: run.save(30, tensors(30), {}, **KEEP, final=True),

@@ -91,7 +91,7 @@ def test_both_displays_know_a_warning_by_its_level(quiet: bool, capsys: pytest.C
         listeners = Listeners([one])
         listeners.warn("clip is high")
         listeners.info("warning: is the first word of a fact")
-        listeners.tell("warning: of a run\x1b")
+        listeners.warn("of a run\x1b")
         out, err = capsys.readouterr()
         assert err == "warning: clip is high\nwarning: of a run\\x1b\n"
         assert out == ("" if quiet else "warning: is the first word of a fact\n")

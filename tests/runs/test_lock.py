@@ -31,7 +31,7 @@ print("locked", flush=True)
 step = 10
 while sys.argv[2] == "write":
     run.record(step, 1.0, {"time/fps": 1.0})
-    run.save(step, {}, {"step": step}, keep=2, say=print)
+    run.save(step, {}, {"step": step}, keep=2, warn=print)
     step += 10
 time.sleep(60)
 """
@@ -41,7 +41,7 @@ time.sleep(60)
 def path(tmp_path: Path) -> Path:
     with Run.create(tmp_path / "run", {"seed": 1}, "name") as run:
         run.record(5, 1.0, {})
-        run.save(5, {}, {"step": 5}, keep=2, say=print)
+        run.save(5, {}, {"step": 5}, keep=2, warn=print)
     return tmp_path / "run"
 
 
@@ -70,9 +70,9 @@ def test_a_second_writer_is_refused_and_told_who_writes(path: Path) -> None:
         for write in (
             lambda run: run.lock(),
             lambda run: run.record(10, 1.0, {}),
-            lambda run: run.save(10, {}, {}, keep=2, say=print),
+            lambda run: run.save(10, {}, {}, keep=2, warn=print),
             lambda run: run.rewind(None),
-            lambda run: run.resume_point(print),
+            lambda run: run.resume_point(print, print),
             lambda run: run.update_settings({}),
             lambda run: run.finish({}),
         ):
@@ -90,11 +90,11 @@ def test_a_killed_writers_lock_is_stale_at_once_and_recognised(path: Path) -> No
     end(first)
     told: list[str] = []
     with Run.open(path) as run:
-        run.resume_point(told.append)
+        run.resume_point(told.append, told.append)
         assert len(told) == 1 and f"left without an end by process {first.pid}" in told[0]
     told.clear()
     with Run.open(path) as run:
-        run.resume_point(told.append)
+        run.resume_point(told.append, told.append)
     assert told == []  # the last one gave it back
     assert (path / NAME).read_text() == ""
 
@@ -116,6 +116,20 @@ def test_a_child_that_outlives_a_killed_writer_holds_nothing(path: Path) -> None
                 time.sleep(0.05)
     finally:
         os.kill(child, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("content", [None, "", "{", '{"env": "CartPole-v1"}'])
+def test_resume_on_the_command_line_names_the_writer_whatever_the_settings_hold(
+    path: Path, content: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their file may be half written by whoever holds the lock."""
+    from tightrope.cli.main import main
+
+    with Run.open(path).lock():
+        if content is not None:
+            (path / "settings.json").write_text(content)
+        assert main(["resume", str(path)]) == 2
+        assert "is being written by this process" in capsys.readouterr().err
 
 
 def test_one_process_has_one_writer_too(path: Path) -> None:
@@ -167,6 +181,6 @@ def test_readers_read_while_it_is_written(path: Path) -> None:
     finally:
         end(first)
     with Run.open(path) as run:
-        point = run.resume_point(lambda text: None)
+        point = run.resume_point(print, print)
         run.rewind(point)
         assert run.read_metrics()[-1]["step"] == point.state["step"]

@@ -157,8 +157,12 @@ def test_alignment(model: str, tmp_path: Path) -> None:
         align(run_dir=run, listeners=[stopping], **given, **values)
     with unchanged(), pytest.raises(Enough):
         resume_align(run, listeners=[stopping], **given)
+    # resume_align itself has to set the threads, and to put them back
+    torch.set_num_threads(2)
+    seen: list[int] = []
     with unchanged():
-        resume_align(run, **given)
+        resume_align(run, listeners=[lambda event: seen.append(torch.get_num_threads())], **given)
+    assert set(seen) == {1}
     with unchanged(), pytest.raises(ValueError, match="no rows"):
         align(run_dir=tmp_path / "none", prompts=[], reward=length, **values)
     with unchanged():

@@ -21,7 +21,7 @@ def steps(run: Run) -> list[int]:
 
 def save(run: Run, step: int, told: list[str], **more: Any) -> None:
     run.save(
-        step, {"policy": {"w": torch.ones(2)}}, {"step": step}, **{"keep": 2, "say": told.append, **more}
+        step, {"policy": {"w": torch.ones(2)}}, {"step": step}, **{"keep": 2, "warn": told.append, **more}
     )
 
 
@@ -76,7 +76,7 @@ def test_a_save_that_fails_prunes_nothing(run: Run, monkeypatch: pytest.MonkeyPa
                 save(run, 30, told)
         assert steps(run) == [10, 20]
         assert history.valid(run.checkpoints, told.append).state["step"] == 20
-    assert len(told) == 1 and told[0].startswith("warning: No checkpoint at step 30")
+    assert len(told) == 1 and told[0].startswith("No checkpoint at step 30")
     save(run, 30, told)
     save(run, 40, told)
     assert steps(run) == [10, 30, 40]  # 10 is the best

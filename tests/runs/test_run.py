@@ -136,7 +136,7 @@ def fail(text: str) -> None:
     raise AssertionError(text)
 
 
-KEEP: dict[str, Any] = {"keep": None, "say": fail}
+KEEP: dict[str, Any] = {"keep": None, "warn": fail}
 
 
 def test_rewind_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_rewind_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
         (run.path / f"{TEMPORARY}settings.json-0").write_text("{")
         with open(run.path / "metrics.jsonl", "a") as file:
             file.write('{"step": 40, "sec')  # a crash in the middle of a line
-        point = run.resume_point(fail)
+        point = run.resume_point(fail, fail)
         assert (point.folder, point.state["at"]) == (run.checkpoint_folder(20), 20)
         run.rewind(point)
         assert [(run.path / n).read_bytes() for n in ("metrics.jsonl", "episodes.jsonl")] == wanted
@@ -184,15 +184,15 @@ def test_records_that_are_not_the_checkpoints_lead_to_an_older_one_or_a_clear_er
         path, told = run.path / "metrics.jsonl", list[str]()
         first, second = path.read_text().splitlines(keepends=True)
         path.write_text(first + change(second))
-        point = run.resume_point(told.append)
+        point = run.resume_point(told.append, told.append)
         assert point.state["at"] == 10
         assert said in told[0] and "metrics.jsonl" in told[0] and "step-000000000020" in told[0]
         path.write_text(change(first))
         with pytest.raises(CheckpointError, match=r"no valid checkpoint.*metrics\.jsonl"):
-            run.resume_point(told.append)
+            run.resume_point(told.append, told.append)
         path.unlink()
         with pytest.raises(CheckpointError, match=r"metrics\.jsonl has 0 bytes"):
-            run.resume_point(told.append)
+            run.resume_point(told.append, told.append)
 
 
 def test_a_checkpoint_that_was_passed_over_is_put_aside(tmp_path: Path) -> None:
@@ -200,8 +200,8 @@ def test_a_checkpoint_that_was_passed_over_is_put_aside(tmp_path: Path) -> None:
     with saved(tmp_path / "a", 10, 20) as run:
         (run.checkpoint_folder(20) / "state.json").write_text("{}")
         told: list[str] = []
-        point = run.resume_point(told.append)
-        assert [text[:8] for text in told] == ["warning:"] and "state.json" in told[0]
+        point = run.resume_point(told.append, told.append)
+        assert [text[:10] for text in told] == ["Checkpoint"] and "state.json" in told[0]
         run.rewind(point)
         assert (run.checkpoints / "unusable-step-000000000020" / "state.json").read_text() == "{}"
         run.save(20, {}, {"at": "again"}, **KEEP)
@@ -211,10 +211,10 @@ def test_a_checkpoint_that_was_passed_over_is_put_aside(tmp_path: Path) -> None:
 def test_a_damaged_best_is_put_aside_and_can_be_saved_again(tmp_path: Path) -> None:
     with saved(tmp_path / "a", 10) as run:
         checkpoint.save(run.best, {}, {"at": 10})
-        run.resume_point(fail)
+        run.resume_point(fail, fail)
         (run.best / "manifest.json").write_text("{}")
         told: list[str] = []
-        assert run.resume_point(told.append).state["at"] == 10
+        assert run.resume_point(told.append, told.append).state["at"] == 10
         assert len(told) == 1 and "unusable-best" in told[0] and "manifest.json" in told[0]
         checkpoint.save(run.best, {}, {"at": 20})
         assert (run.path / "unusable-best").is_dir()

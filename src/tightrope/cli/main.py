@@ -53,7 +53,11 @@ def resume(words: list[str]) -> int:
     given = resume_parser().read(words)
     from tightrope.runs.run import Run
 
-    settings = Run.open(given["run"]).settings
+    try:
+        settings = Run.open(given["run"]).settings
+    except ValueError:  # who writes there now comes first: RunInUse
+        with Run.open(given["run"], own=True) as run_folder:
+            settings = run_folder.settings
     if "env" not in settings:
         from tightrope.cli.language import resume as resume_language
 

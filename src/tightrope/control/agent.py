@@ -38,6 +38,7 @@ from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import ObservationLayout
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint
+from tightrope.training.events import Message
 from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors
 
@@ -289,25 +290,27 @@ class Agent:
         self.sampling_rng.bit_generator.state = state["rng"]["sampling"]
         self.update_rng.bit_generator.state = state["rng"]["update"]
 
-    def resume_episodes(self, episodes: Any) -> list[str]:
+    def resume_episodes(self, episodes: Any) -> Message | None:
         """After `restore`: continue the episodes that ran at the checkpoint, ``episodes`` as
         `Collector.state` gave them, where the environments can take their state. Otherwise new episodes
-        begin, as they do at this step in an uninterrupted run; the lines to print say so.
+        begin, as they do at this step in an uninterrupted run; the message, which is for people, states it.
         """
         if not self.steps:
-            return []
+            return None
         if episodes is not None and self.environments.gives_state:
             self.collector.restore(episodes)
             self.fresh = False
-            return []
+            return None
         what = f"{self.environments.num_envs} environments begin new episodes at step {self.steps:,}"
         if episodes is not None:
-            return [
-                f"warning: {what}: the run's environments could give their state, these cannot, so that the "
-                "end may differ."
-            ]
+            return Message(
+                f"{what}: the run's environments could give their state, these cannot; the end may differ.",
+                "warning",
+            )
         seed = self.settings.seed
-        return [f"{what}, with seeds of (seed {seed}, step), as on every point of the checkpoint grid."]
+        return Message(
+            f"{what}, with seeds of (seed {seed}, step), as on every point of the checkpoint grid."
+        )
 
     def roll_back(self, tensors: Tensors, state: dict[str, Any]) -> None:
         """Go back to a checkpoint of this agent, with random generators that depend on the seed, the step and

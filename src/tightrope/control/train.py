@@ -43,7 +43,7 @@ def train(
         told.warn(risk)
     require_tensorboard(settings.tensorboard)
     source = settings.env if env is None else env
-    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=told.tell)
+    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=told.info)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
     with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name) as run:
@@ -51,7 +51,7 @@ def train(
         if agent.policy.own is not None or not isinstance(source, str):
             # settings.json alone could not give these first weights again
             tensors, state = learner.snapshot()
-            run.save(0, tensors, state, keep=settings.keep_checkpoints, say=told.tell)
+            run.save(0, tensors, state, keep=settings.keep_checkpoints, warn=told.warn)
         with contextlib.closing(learner):
             return loop.train(learner, run, told)
 
@@ -94,7 +94,7 @@ def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy
             total_steps = int(run.settings["total_steps"])
     settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
-    agent = rebuild(source, run_dir, command="resume", policy=policy, settings=settings, notify=told.tell)
+    agent = rebuild(source, run_dir, command="resume", policy=policy, settings=settings, notify=told.info)
     learner = AgentLearner(agent, run, told)
     with contextlib.closing(agent), contextlib.closing(learner):
         if point is not None:
@@ -230,9 +230,9 @@ class AgentLearner:
             best = point.state.get("best")
             self.best = -math.inf if best is None else float(best)
             self.seconds = float(point.state.get("wall_seconds", 0.0))
-            lines = self.agent.resume_episodes(point.state.get("episodes"))
-        for line in lines:
-            self.listeners.tell(line)
+            message = self.agent.resume_episodes(point.state.get("episodes"))
+        if message is not None:
+            self.listeners(message)
 
     def roll_back(self, point: Checkpoint) -> None:
         """Put back a checkpoint of this run; the best policy stays."""

@@ -34,15 +34,16 @@ def steps_in(checkpoints: Path) -> list[Path]:
 
 
 def valid(
-    checkpoints: Path, notify: Callable[[str], None] | None = None, accept: Callable[..., None] | None = None
+    checkpoints: Path, warn: Callable[[str], None] | None = None, accept: Callable[..., None] | None = None
 ) -> Checkpoint:
     """The newest valid checkpoint in a folder of them, read.
 
-    A damaged one is passed over, and ``notify`` (None: a warning) told which and why; so is one for which
-    ``accept`` raises CheckpointError. One that its writer deletes meanwhile is no longer looked for.
+    A damaged one is passed over, and so is one for which ``accept`` raises CheckpointError; ``warn`` gets
+    which and why (None: a Python warning). One that its writer deletes meanwhile is no longer looked for.
     CheckpointError when none is left.
     """
-    checkpoints, tell, why = Path(checkpoints), notify or _warn, ""
+    checkpoints, why = Path(checkpoints), ""
+    warn = warn or _warn
     for _ in range(LOOKS):
         found, vanished = steps_in(checkpoints), False
         for folder in reversed(found):
@@ -56,7 +57,7 @@ def valid(
                 if vanished:  # there is a newer one now
                     break
                 why = str(error)
-                tell(f"Checkpoint passed over: {why}")
+                warn(f"Checkpoint passed over: {why}")
         if not vanished:
             break
     if found:

@@ -176,7 +176,7 @@ class Run:
         state: dict[str, Any],
         *,
         keep: int | None,
-        say: Callable[[str], None],
+        warn: Callable[[str], None],
         merit: float | None = None,
         final: bool = False,
     ) -> None:
@@ -189,7 +189,7 @@ class Run:
         waits for the end.
         """
         with signals.uninterrupted():
-            self._save(step, tensors, state, keep=keep, say=say, merit=merit, final=final)
+            self._save(step, tensors, state, keep=keep, warn=warn, merit=merit, final=final)
 
     def _save(
         self,
@@ -198,7 +198,7 @@ class Run:
         state: dict[str, Any],
         *,
         keep: int | None,
-        say: Callable[[str], None],
+        warn: Callable[[str], None],
         merit: float | None,
         final: bool,
     ) -> None:
@@ -213,12 +213,12 @@ class Run:
         except CannotWrite as error:
             if final:
                 raise
-            say(f"warning: No checkpoint at step {step:,}: {error.what} {error.advice}. Training goes on.")
+            warn(f"No checkpoint at step {step:,}: {error.what} {error.advice}. Training goes on.")
             return
         try:
             history.prune(self.checkpoints, keep)
         except OSError as error:
-            say(f"warning: An old checkpoint cannot be deleted: {error}. See to {self.checkpoints}.")
+            warn(f"An old checkpoint cannot be deleted: {error}. See to {self.checkpoints}.")
         size = sum(path.stat().st_size for path in folder.iterdir())
         seconds = time.perf_counter() - clock
         self._costs = {"time/checkpoint_seconds": seconds, "time/checkpoint_megabytes": size / 1e6}
@@ -243,30 +243,30 @@ class Run:
         for parent in (self.path, self.checkpoints):
             durable.remove_leftovers(parent)
 
-    def resume_point(self, say: Callable[[str], None]) -> Checkpoint:
+    def resume_point(self, warn: Callable[[str], None], info: Callable[[str], None]) -> Checkpoint:
         """Where the run can go on: the newest checkpoint that is valid and counts on no more than the record
-        files hold. ``say`` is told what was passed over, who left the run without an end, and what has
-        changed since. Raises CheckpointError where there is none.
+        files hold. ``warn`` gets what was passed over and what has changed since, ``info`` who left the run
+        without an end. Raises CheckpointError where there is none.
         """
         self.lock()
         assert self._lock is not None
         if self._lock.left_by:
-            say(f"the run was left without an end by {self._lock.left_by}")
-        self._put_aside_a_damaged_best(say)
-        point = history.valid(self.checkpoints, lambda text: say(f"warning: {text}"), self._check_records)
+            info(f"the run was left without an end by {self._lock.left_by}")
+        self._put_aside_a_damaged_best(warn)
+        point = history.valid(self.checkpoints, warn, self._check_records)
         manifest = checkpoint.read_manifest(durable.present(point.folder))
         if changed := versions.version_changes(manifest.get("versions")):
-            say(f"warning: {changed} since the checkpoint: the run goes on, but its last bits may differ.")
+            warn(f"{changed} since the checkpoint: the run goes on, but its last bits may differ.")
         return point
 
-    def _put_aside_a_damaged_best(self, say: Callable[[str], None]) -> None:
+    def _put_aside_a_damaged_best(self, warn: Callable[[str], None]) -> None:
         """So that it can be saved again: what is no checkpoint is never replaced."""
         if not durable.present(self.best).is_dir():
             return
         try:
             checkpoint.verify(self.best)
         except CheckpointError as error:
-            say(f"warning: The best policy is lost, its folder renamed to unusable-best: {error}")
+            warn(f"The best policy is lost, its folder renamed to unusable-best: {error}")
             durable.put(durable.present(self.best), self.path / "unusable-best")
 
     def _check_records(self, point: Checkpoint) -> None:

@@ -13,7 +13,6 @@ from typing import Any, Literal
 from tightrope.runs.records import printable
 
 Level = Literal["info", "warning"]
-WARNING = "warning: "  # how a warning begins where it is only text
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class Message:
     level: Level = "info"
 
     def __str__(self) -> str:
-        return f"{WARNING}{self.text}" if self.level == "warning" else self.text
+        return f"warning: {self.text}" if self.level == "warning" else self.text
 
 
 @dataclass(frozen=True)
@@ -112,14 +111,9 @@ class Listeners:
             self.requests.append(asked)
 
     def info(self, text: str) -> None:
-        """Send a line."""
-        self(Message(text))
+        """Send a line, made safe for a terminal."""
+        self(Message(printable(text)))
 
     def warn(self, text: str) -> None:
-        """Send a warning; ``text`` without the word."""
-        self(Message(text, "warning"))
-
-    def tell(self, text: str) -> None:
-        """Send a text, made safe for a terminal; it is a warning when it begins with "warning: "."""
-        level: Level = "warning" if text.startswith(WARNING) else "info"
-        self(Message(printable(text.removeprefix(WARNING)), level))
+        """Send a warning, made safe for a terminal; ``text`` without the word."""
+        self(Message(printable(text), "warning"))

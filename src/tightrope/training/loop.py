@@ -78,7 +78,7 @@ class _Loop:
             raise error
         seconds = learner.seconds
         try:
-            point = run.resume_point(self.listeners.tell)
+            point = run.resume_point(self.listeners.warn, self.listeners.info)
             run.rewind(point)
             learner.roll_back(point)
         except ValueError as missing:
@@ -86,8 +86,8 @@ class _Loop:
         learner.seconds = seconds
         restore_changes(learner, run)
         reason = str(error).splitlines()[0]
-        self.listeners.tell(
-            f"warning: {reason} Going back to the checkpoint of step {learner.position}, "
+        self.listeners.warn(
+            f"{reason} Going back to the checkpoint of step {learner.position}, "
             f"{learner.rollbacks} of {limit} times at most (max_rollbacks), with other random numbers from "
             "there."
         )
@@ -138,7 +138,7 @@ class _Loop:
             tensors,
             state,
             keep=learner.settings.keep_checkpoints,
-            say=self.listeners.tell,
+            warn=self.listeners.warn,
             merit=learner.merit,
             final=final,
         )

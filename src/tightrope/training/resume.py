@@ -12,7 +12,7 @@ from tightrope.training.learner import Learner, change
 def newest_point(run: Run, listeners: Listeners) -> Checkpoint | None:
     """The newest checkpoint that can be used; None where the run has saved nothing yet."""
     if steps_in(run.checkpoints):
-        return run.resume_point(listeners.tell)
+        return run.resume_point(listeners.warn, listeners.info)
     if run.read_metrics():
         listeners.warn(f"{run.path} has rows and no checkpoint; it begins at step 0 again.")
     return None

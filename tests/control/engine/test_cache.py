@@ -94,15 +94,14 @@ def test_numbas_own_setting_is_left_alone():
     assert "tightrope" not in str(numba.config.CACHE_DIR)
 
 
-def test_a_warm_start_needs_no_compiler_and_little_memory(warm):
-    _, memory, modules = start(warm.parents[2])
+def test_a_warm_start_needs_no_compiler(warm):
+    _, _, modules = start(warm.parents[2])
     assert "tightrope.control.engine.compiled.update" in modules
     assert not [name for name in (*COMPILER, "scipy.linalg") if name in modules]
-    assert memory < 130  # MB; about 90, and 40 more with all that numba needs for a compilation
 
 
 def test_damaged_and_foreign_entries_are_compiled_again_to_the_same_bits(warm):
-    expected, _, _ = start(warm.parents[2])
+    expected, memory, _ = start(warm.parents[2])
     entry, other = (
         warm / f"tightrope.control.engine.compiled.{name}"
         for name in ("infer.gae_batch", "update.run_epochs")
@@ -112,8 +111,11 @@ def test_damaged_and_foreign_entries_are_compiled_again_to_the_same_bits(warm):
     entry.write_bytes(data)
     foreign = pickle.dumps(("another", "program"))
     other.write_bytes(hashlib.sha256(foreign).digest() + foreign)
-    bits, _, modules = start(warm.parents[2])
+    bits, with_compiler, modules = start(warm.parents[2])
     assert bits == expected and set(COMPILER) <= set(modules)
+    assert (
+        sys.platform != "linux" or memory < with_compiler - 20
+    )  # MB; what numba needs to compile is about 40
     assert len(entry.read_bytes()) > len(sound) // 2 and entry.read_bytes() != data
     assert entry.stat().st_mode & 0o777 == 0o600
     bits, _, modules = start(warm.parents[2])  # they have been replaced

@@ -72,7 +72,7 @@ class Trainer:
         self.roles: Roles = make_roles(
             settings,
             on_trunk,
-            listeners.tell,
+            listeners.info,
             own_reward=on_trunk is None and is_folder(reward),
         )
         self.prompts = self._read_prompts(prompts)

