@@ -445,7 +445,7 @@ def clean_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
 
 def fake_training(train: Any) -> None:
     module = types.ModuleType("tightrope.control.train")
-    module.train = train  # type: ignore[attr-defined]
+    module.train = module.resume = train  # type: ignore[attr-defined]
     sys.modules["tightrope.control.train"] = module
 
 
@@ -598,7 +598,7 @@ def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) 
             return True
 
     stream = Terminal()
-    report = display.choose(stream, quiet=False, live=True)
+    report = display.Display(display.CONTROL, stream, live=True)
     begin = time.monotonic()
     with report:
         a_run(tmp_path)(TrainSettings(), None, [report])
@@ -661,7 +661,7 @@ def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
         def write(self, text: str) -> int:
             raise BrokenPipeError
 
-    report = display.choose(Gone(), quiet=False, live=False)
+    report = display.Display(display.CONTROL, Gone())
     with report:
         summary = a_run(tmp_path)(TrainSettings(), None, [report])
     assert summary == SUMMARY
@@ -671,8 +671,8 @@ def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
 def test_time_left_counts_this_runs_steps_only(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    progress = display.Position()
-    progress.take(Started("run", SETTINGS, 400, 1000, ()))
+    progress = display.Display(display.CONTROL, sys.stdout)
+    progress(Started("run", SETTINGS, 400, 1000, ()))
     now[0] += 10.0
-    progress.take(Updated(600, 1000, 1.0, {}))
+    progress(Updated(600, 1000, 1.0, {}))
     assert progress.seconds_left() == pytest.approx(20.0)

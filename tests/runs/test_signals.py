@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tightrope.cli import farewell
+from tightrope.cli.training import farewell
 from tightrope.runs import signals
 
 BOTH = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -28,7 +28,7 @@ def test_a_signal_stops_at_once_and_says_its_exit_code(number, code):
         os.kill(os.getpid(), number)
         time.sleep(5)
         pytest.fail("it went on")
-    assert caught.value.code == farewell.code_of(caught.value) == code
+    assert caught.value.code == code
     assert signal.getsignal(number) == before
 
 
@@ -60,8 +60,8 @@ def test_what_swallows_a_signal_is_stopped_at_the_next_update():
 
 def test_before_a_run_and_without_a_checkpoint(tmp_path):
     error = signals.Stopped(signal.SIGTERM)
-    assert farewell.farewell(error, None, 0, "steps", "") == "Stopped by SIGTERM before the run began."
-    said = farewell.farewell(KeyboardInterrupt(), str(tmp_path), 1200, "responses", "tightrope resume r")
+    assert farewell(error, None, 0, "steps", "") == "Stopped by SIGTERM before the run began."
+    said = farewell(KeyboardInterrupt(), str(tmp_path), 1200, "responses", "tightrope resume r")
     assert said.startswith("Stopped at response 1,200. There is no checkpoint yet: all 1,200 responses")
 
 
