@@ -15,7 +15,7 @@ WIDTH = 100
 
 
 class UsageError(TightropeError, ValueError):
-    """The command line is wrong; the message says how, and what was probably meant."""
+    """The command line is wrong; the message explains how, and suggests what was probably meant."""
 
 
 class Parser(argparse.ArgumentParser):

@@ -164,8 +164,8 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether the message is worded for the user, so that no traceback is needed: an error class of ours, or
-    another one that our own code raised (a ValueError about a setting).
+    """Whether the message is written for the user, so that no traceback is needed: one of our error classes,
+    or another error that our own code raised (a ValueError about a setting).
     """
     if isinstance(error, TightropeError | OSError):
         return True
@@ -196,7 +196,7 @@ def main(words: list[str] | None = None) -> int:
             return _dispatch(words)
     except (TightropeError, ValueError, OSError, RuntimeError, FloatingPointError) as error:
         if isinstance(error, BrokenPipeError):
-            # whoever read our output is gone; Python must not try to flush to it on its way out
+            # the reader of our output is gone; Python must not flush to it at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
         if not _is_ours(error):

@@ -84,7 +84,7 @@ OWN_FIELDS = {"sft": "on_completions", "reward": "demonstrations", "align": "max
 
 
 def print_json(value: dict[str, Any]) -> None:
-    """A line of JSON on standard output: what --json promises, numbers that JSON cannot hold as null."""
+    """Print a line of JSON to standard output, for --json; numbers that JSON cannot hold become null."""
     from tightrope.runs.records import dumps
 
     print(dumps(value), flush=True)
@@ -119,7 +119,7 @@ def _common(parser: Parser, *, run: bool) -> None:
         group.add_argument(
             "--env",
             metavar="ID",
-            help="The task again; needed where its id names a module (default: the run's own).",
+            help="The task again; needed if its id names a module (default: the run's own).",
         )
 
 
@@ -141,7 +141,7 @@ def training_parser(command: str, algorithm: str = "ppo") -> Parser:
             add_fields(group, rule, settings_fields(rule))
     folder = "ENV-ALGORITHM-SEED-TIME" if command == "train" else "COMMAND-MODEL-TIME"
     group = parser.add_argument_group("run")
-    group.add_argument("--run-dir", metavar="FOLDER", help=f"Where the run lies (default runs/{folder}).")
+    group.add_argument("--run-dir", metavar="FOLDER", help=f"Where the run is saved (default runs/{folder}).")
     group.add_argument(
         "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
     )
@@ -171,7 +171,7 @@ def _groups(command: str) -> Mapping[str, Iterable[str]]:
 def _run_parser(
     command: str, description: str, folder: str = "Run folder, or a folder that agent.save wrote."
 ) -> Parser:
-    """The beginning of a command about a run: its name, and the argument RUN with ``folder`` as its help."""
+    """A parser for a command about a run, with the argument RUN; ``folder`` is its help."""
     parser = Parser(f"{PROGRAM} {command}", "%(prog)s RUN [options]", description)
     parser.add_argument("run", metavar="RUN", help=folder)
     return parser
@@ -216,9 +216,9 @@ def record_parser() -> Parser:
 def resume_parser() -> Parser:
     """The options of ``resume``."""
     parser = _run_parser(
-        "resume", "Go on with a run from its newest checkpoint, in the same folder.", "Run folder."
+        "resume", "Continue a run from its newest checkpoint, in the same folder.", "Run folder."
     )
-    group = parser.add_argument_group("going on")
+    group = parser.add_argument_group("continuing")
     group.add_argument(
         "--total-steps",
         type=_at_least_one,
@@ -228,17 +228,17 @@ def resume_parser() -> Parser:
     group.add_argument(
         "--reward",
         metavar="R",
-        help="align: the reward again, where it was your own code (default: the run's).",
+        help="align: the reward again, if it was your own code (default: the run's).",
     )
     group.add_argument(
         "--gold",
         metavar="R",
-        help="align: the gold judge again, where it was your own code (default: the run's).",
+        help="align: the gold judge again, if it was your own code (default: the run's).",
     )
     group.add_argument(
         "--data",
         metavar="FILE",
-        help="Language: the data again, where they were no file, or lie elsewhere (default: the run's).",
+        help="Language: the data again, if they were not a file or have moved (default: the run's).",
     )
     _common(parser, run=True)
     return parser

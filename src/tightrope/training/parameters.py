@@ -1,4 +1,4 @@
-"""Every tensor that training changes, out of the model and back."""
+"""Save and restore every tensor that training changes."""
 
 from __future__ import annotations
 
