@@ -119,7 +119,7 @@ def settings_fields(kind: type) -> dict[str, dataclasses.Field[Any]]:
     return {f.name: f for f in dataclasses.fields(kind) if f.init and f.name not in ("env", "update")}
 
 
-def add_fields(group: Any, kind: type, names: Iterable[str]) -> None:
+def add_fields(group: argparse._ArgumentGroup, kind: type, names: Iterable[str]) -> None:
     """One option a field: its help is made from doc, range and default."""
     fields = settings_fields(kind)
     for name in names:

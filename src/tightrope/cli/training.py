@@ -27,6 +27,7 @@ from tightrope.cli.options import (
 )
 from tightrope.runs import checkpoint, signals
 from tightrope.runs.run import Run
+from tightrope.settings.values import Settings
 
 VIEWS = {"train": display.CONTROL, "sft": display.SFT, "reward": display.REWARD, "align": display.ALIGN}
 # settings that must be given, and how they are typed
@@ -49,7 +50,7 @@ def train(command: str, words: list[str]) -> int:
         import_env_module(given)
         from tightrope.control.resolve import resolve
 
-        settings: Any = resolve(env, values.pop("algorithm", "ppo"), values)
+        settings: Settings = resolve(env, values.pop("algorithm", "ppo"), values)
     else:
         settings = SETTINGS_CLASSES[command]().with_values(**values)
     if dry_run(settings, given):
