@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -106,28 +105,3 @@ def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environme
         squash=settings.squash,
         policy=policy_of(settings),
     )
-
-
-def evaluate_run(
-    path: str | Path,
-    *,
-    episodes: int = 100,
-    stochastic: bool = False,
-    best: bool = False,
-    seed: int | None = None,
-    env: Any = None,
-    policy: Any = None,
-    device: str = "cpu",
-) -> dict[str, Any]:
-    """Evaluate the policy of a run or of a saved folder; see evaluate_agent."""
-    from tightrope.control.saving import load
-
-    agent = load(path, env=env, policy=policy, best=best, device=device, engine="torch")  # nothing is learnt
-    try:
-        environments = evaluation_environments(agent.env, agent.settings, episodes)
-        seed = EVALUATION_SEED if seed is None else seed
-        result = evaluate_agent(agent, environments, episodes, seed=seed, deterministic=not stochastic)
-        environments.close()
-    finally:
-        agent.close()
-    return {**result, "step": agent.steps, "seed": seed, "deterministic": not stochastic}

@@ -44,6 +44,20 @@ def find_spec(env_id: str) -> EnvSpec | None:
     return gym.registry.get(env_id.rpartition(":")[2])
 
 
+def name_of(env: Any) -> str:
+    """An id; the id of an environment object, else the name of its class or of the factory."""
+    if isinstance(env, str):
+        return env
+    known = getattr(getattr(env, "spec", None), "id", None) or getattr(env, "__name__", None)
+    return str(known or type(getattr(env, "unwrapped", env)).__name__)
+
+
+def time_limit(env: Any) -> int | None:
+    """The steps after which an id or an environment object truncates an episode; None: none, or unknown."""
+    spec = find_spec(env) if isinstance(env, str) else getattr(env, "spec", None)
+    return getattr(spec, "max_episode_steps", None)
+
+
 def entry_module(spec: EnvSpec | None) -> str:
     """The module that a spec's entry point lies in, empty when unknown."""
     point = spec.entry_point if spec is not None else None
@@ -197,6 +211,20 @@ def _did_you_mean(name: str, known: Any) -> str:
     same = sorted((v for k, v in lowered.items() if k.rpartition("-v")[0] == stem), reverse=True)
     names = list(dict.fromkeys([*same, *(lowered[key] for key in close)]))[:3]
     return f" Did you mean {' or '.join(names)}?" if names else ""
+
+
+def makers_of(env: Any, num_envs: int) -> list[Callable[[], gym.Env]]:
+    """One function per copy of an id, an instance (it is copy 0 itself) or a factory. ValueError: neither."""
+    if isinstance(env, str):
+        return [lambda: make_by_id(env)] * num_envs
+    if isinstance(env, gym.Env):
+        return replicas(env, num_envs)
+    if callable(env):
+        return [env] * num_envs
+    raise ValueError(
+        f"env is a {type(env).__name__}; expected a Gymnasium id, an environment, a zero-argument "
+        "factory or a vector environment."
+    )
 
 
 def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env]) -> None:
