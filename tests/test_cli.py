@@ -429,9 +429,7 @@ SUMMARY = {
 def clean_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     """Undo what a command may change: working folder, sys.path, modules."""
     path, folder = list(sys.path), os.getcwd()
-    before = {
-        name: sys.modules.get(name) for name in ("tightrope.control.train", "tightrope.control.saving")
-    }
+    before = {name: sys.modules.get(name) for name in ("tightrope.control.train", "tightrope.control.saving")}
     yield
     sys.path[:] = path
     os.chdir(folder)

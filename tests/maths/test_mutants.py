@@ -135,7 +135,7 @@ MUTANTS = (
         "return -logp * advantages",
         "return logp * advantages",
     ),
-    Mutant("the lower clip is counted above", "surrogate.py", ".exp() < 1 - clip", ".exp() < 1 + clip"),
+    Mutant("the lower clip is counted above", "surrogate.py", "ratio < 1 - clip", "ratio < 1 + clip"),
     Mutant("the half is missing", "values.py", "0.5 * error.square()", "error.square()"),
     Mutant(
         "the max is lost",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,16 +14,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a model says of a batch: ``logp``, ``entropy`` and ``values``, each [B, T]."""
+    """What a model returns for a batch: ``logp``, ``entropy`` and ``values``, each [B, T]."""
 
     logp: Tensor
     entropy: Tensor
     values: Tensor
-
-    def within(self, mask: Tensor) -> Self:
-        """The same with 0 outside the mask: what a model computes for padding reaches no gradient."""
-        figures = {name: torch.where(mask, x, 0.0) for name, x in vars(self).items()}
-        return dataclasses.replace(self, **figures)  # a subclass keeps its own figures
 
 
 @dataclass(frozen=True)

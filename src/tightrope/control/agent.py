@@ -31,9 +31,8 @@ from tightrope.control.environments.processes import available_cores
 from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve
-from tightrope.control.rollout.advantages import to_batch
 from tightrope.control.rollout.collector import Collector
-from tightrope.control.rollout.rollout import Rollout
+from tightrope.control.rollout.rollout import Rollout, to_batch
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import ObservationLayout
 from tightrope.maths.values import explained_variance
@@ -42,16 +41,15 @@ from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors
 
 Array = np.ndarray
-CRUMB = 16  # columns; ten epochs on fewer steps than this would only add noise to a finished policy
+MIN_COLUMNS = 16  # ten epochs on fewer steps than this would only add noise to a finished policy
 
 
 class Agent:
     """A policy that learns on an environment. Use PPO, A2C or Reinforce.
 
     ``env``: a Gymnasium id, an environment, a factory or a vector environment.  ``policy``: a torch module of
-    your own (see Policy).  ``notify`` gets lines worth saying, such as a compilation.  Everything else is a
-    field of TrainSettings or of the algorithm's settings, by name; what is not given comes from the preset of
-    the task.
+    your own (see Policy).  ``notify`` gets messages, such as that the engine is compiled.  Every other
+    argument is a field of TrainSettings or of the algorithm's settings; defaults come from the task's preset.
     """
 
     algorithm: ClassVar[str]
@@ -122,11 +120,9 @@ class Agent:
             yield Update(after, budget, metrics, before, on_grid, episodes)
 
     def _next_columns(self, budget: int, start: int) -> int:
-        """Columns of the next rollout, never more than the budget allows; a crumb at its end is left
-        alone.
-        """
+        """Columns of the next rollout, within the budget; 0 when too few are left to learn from."""
         columns = min(self.settings.num_steps, (budget - (self.steps - start)) // self.environments.num_envs)
-        enough = self.steps == start or columns >= min(CRUMB, self.settings.num_steps)
+        enough = self.steps == start or columns >= min(MIN_COLUMNS, self.settings.num_steps)
         return columns if enough else 0
 
     def _one_update(
@@ -143,10 +139,7 @@ class Agent:
         batch = to_batch(rollout, self.engine, self.normalisers, present)
         metrics: dict[str, float] = {}
         if bool(batch.mask.any()):
-            if check and (line := self.engine.check(batch, present)):
-                self.notify(line)
             metrics = self.engine.update(
-                self.optimiser,
                 batch,
                 present,
                 self.update_rng,
@@ -195,11 +188,10 @@ class Agent:
         action_mask = flat_mask(masks, rows, actions)
         if action_mask is not None:
             inputs = {**inputs, "action_mask": action_mask}
-        tensors = self.policy.tensors(inputs)
         if deterministic:
-            chosen = self.policy.mode(tensors)
+            chosen = self.policy.mode(inputs)
         else:
-            chosen = self.policy.sample(tensors, self.noise(rows, self.predict_rng), self.predict_rng)
+            chosen = self.policy.sample(inputs, self.noise(rows, self.predict_rng), self.predict_rng)
         matrix = chosen.cpu().numpy()
         squash = self.settings.squash
         return (actions.to_env(matrix, squash) if batched else actions.to_env_single(matrix[0], squash)), None
@@ -209,17 +201,15 @@ class Agent:
         layout = self.environments.observation_layout
         batched = _is_batched(layout, observation)
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
-        tensors = self.policy.tensors(inputs)
-        with torch.no_grad():
-            values = self.policy.values(tensors).cpu().numpy()
+        values = self.policy.values(inputs).cpu().numpy()
         values = values * (
             self.normalisers.rewards.deviation if self.normalisers.rewards is not None else 1.0
         )
         return values if batched else float(values[0])
 
-    def noise(self, rows: int, rng: np.random.Generator) -> torch.Tensor:
+    def noise(self, rows: int, rng: np.random.Generator) -> Array:
         """Noise [rows, A] for Policy.act."""
-        return torch.from_numpy(self.collector.noise(1, rows, rng)[0]).to(self.policy.device)
+        return self.collector.noise(1, rows, rng)[0]
 
     # ------------------------------------------------------------------------------------- moving and saving
 

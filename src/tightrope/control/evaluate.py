@@ -65,11 +65,10 @@ def act(
     if action_mask is not None:
         inputs = {**inputs, "action_mask": action_mask}
     policy = agent.policy
-    tensors = policy.tensors(inputs)
     if rng is None:
-        return policy.mode(tensors).cpu().numpy()
+        return policy.mode(inputs).cpu().numpy()
     rows = len(next(iter(inputs.values())))
-    return policy.sample(tensors, agent.noise(rows, rng), rng).cpu().numpy()
+    return policy.sample(inputs, agent.noise(rows, rng), rng).cpu().numpy()
 
 
 def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:

@@ -265,12 +265,8 @@ class Component:
     parameter: int  # first of its parameters among the actor's P outputs
     count: int  # categories, bits, or dimensions
     column: int  # first of its columns in the action matrix
+    width: int  # how many columns: one index, or one a bit or dimension
     mask: int  # first of its entries in the flat mask; -1 for gaussian
-
-    @property
-    def width(self) -> int:
-        """How many columns of the action matrix it has: one index, or one a bit or dimension."""
-        return 1 if self.kind == "categorical" else self.count
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,9 +446,11 @@ def action_layout(space: Space) -> ActionLayout:
         for count in counts:
             if count == 0:
                 continue
-            components.append(Component(kind, parameter, count, column, -1 if kind == "gaussian" else logit))
+            width = 1 if kind == "categorical" else count
+            mask = -1 if kind == "gaussian" else logit
+            components.append(Component(kind, parameter, count, column, width, mask))
             parameter, logit = parameter + count, logit + (count if kind != "gaussian" else 0)
-            column += 1 if kind == "categorical" else count
+            column += width
         leaves.append(ActionLeaf(path, part, slice(first, column), low, high))
     if not components:
         raise ValueError(

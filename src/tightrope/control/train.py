@@ -38,22 +38,22 @@ def train(
     policy: Any = None,
 ) -> dict[str, Any]:
     """Train from the start; returns the summary that is also written to the run folder."""
-    told = Listeners(listeners)
+    report = Listeners(listeners)
     for risk in settings.risks():
-        told.warn(risk)
+        report.warn(risk)
     require_tensorboard(settings.tensorboard)
     source = settings.env if env is None else env
-    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=told.tell)
+    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=report.tell)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
     with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name) as run:
-        learner = AgentLearner(agent, run, told)
+        learner = AgentLearner(agent, run, report)
         if agent.policy.own is not None or not isinstance(source, str):
-            # settings.json alone could not give these first weights again
+            # settings.json is not enough to make these first weights again
             tensors, state = learner.snapshot()
-            run.save(0, tensors, state, keep=settings.keep_checkpoints, say=told.tell)
+            run.save(0, tensors, state, keep=settings.keep_checkpoints, say=report.tell)
         with contextlib.closing(learner):
-            return loop.train(learner, run, told)
+            return loop.train(learner, run, report)
 
 
 def resume(
@@ -73,9 +73,9 @@ def resume(
         return _resume(run, total_steps, Listeners(listeners), env, policy)
 
 
-def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy: Any) -> dict[str, Any]:
+def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, policy: Any) -> dict[str, Any]:
     run_dir = run.path
-    point = newest_point(run, told)
+    point = newest_point(run, listeners)
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
         settings = TrainSettings.from_json(run.settings if point is None else state["settings"])
@@ -94,15 +94,17 @@ def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy
             total_steps = int(run.settings["total_steps"])
     settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
-    agent = rebuild(source, run_dir, command="resume", policy=policy, settings=settings, notify=told.tell)
-    learner = AgentLearner(agent, run, told)
+    agent = rebuild(
+        source, run_dir, command="resume", policy=policy, settings=settings, notify=listeners.tell
+    )
+    learner = AgentLearner(agent, run, listeners)
     with contextlib.closing(agent), contextlib.closing(learner):
         if point is not None:
             learner.restore(point)
         continue_from(learner, run, point)
         if learner.complete:
-            told.info(f"{run_dir} has its {learner.total} steps; --total-steps N goes on from there.")
-        return loop.train(learner, run, told)
+            listeners.info(f"{run_dir} has its {learner.total} steps; --total-steps N goes on from there.")
+        return loop.train(learner, run, listeners)
 
 
 class AgentLearner:

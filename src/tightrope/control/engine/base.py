@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -29,8 +29,19 @@ class Acted(NamedTuple):
     logp: Array  # float32 [N]: log-probability of these actions
 
 
+class Steps(NamedTuple):
+    """What advantages are computed from (see maths.returns): float32 and bool arrays [B, T]."""
+
+    rewards: Array
+    values: Array
+    next_values: Array
+    terminated: Array
+    ended: Array
+    mask: Array
+
+
 class Engine(Protocol):
-    """What computes: acting, values, advantages and updates. Torch is the reference."""
+    """What computes: acting, values, advantages and updates of one policy. Torch is the reference."""
 
     @property
     def name(self) -> str:
@@ -64,32 +75,20 @@ class Engine(Protocol):
     def values(self, inputs: dict[str, Array]) -> Array:
         """Values [N] of encoded observations [N, ...]."""
 
-    def gae(
-        self,
-        rewards: Array,
-        values: Array,
-        next_values: Array,
-        terminated: Array,
-        ended: Array,
-        mask: Array,
-        gamma: float,
-        gae_lambda: float,
-    ) -> Array:
+    def gae(self, steps: Steps, gamma: float, gae_lambda: float) -> Array:
         """Advantages [B, T] float32: maths.returns.gae on arrays."""
 
     def update(
         self,
-        optimiser: torch.optim.Optimizer,
         batch: Batch,
         settings: UpdateSettings,
         rng: np.random.Generator,
-        **more: Any,
+        *,
+        refresh: Callable[[Batch], Batch] | None = None,
+        log_ratio_limit: float | None = None,
     ) -> dict[str, float]:
-        """The algorithm's update."""
-
-    def check(self, batch: Batch, settings: UpdateSettings) -> str:
-        """Compare one minibatch with the reference: a line for the user, empty when there is nothing to
-        compare. RuntimeError when they differ.
+        """The algorithm's update. ``log_ratio_limit`` is given for the first one of a run, in which the
+        compiled engine is compared with the reference; RuntimeError when they differ.
         """
 
     def close(self) -> None:

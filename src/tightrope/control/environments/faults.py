@@ -213,33 +213,6 @@ def describe(value: Any) -> str:
 # --------------------------------------------------------------------------------------------------- checks
 
 
-def check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
-    """The pair (observation, info) that ``reset`` returned; ApiBreak when it is something else."""
-    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
-        raise ApiBreak(
-            f"reset returned {describe(result)}, expected the pair (observation, info dict). "
-            "Environments of the old gym API must be ported to Gymnasium 1.x"
-        )
-    return result
-
-
-def check_step(result: Any) -> None:
-    """Check the first step of an environment; ApiBreak names what it returned and what was expected."""
-    if not isinstance(result, tuple) or len(result) != 5:
-        raise ApiBreak(
-            f"step returned {describe(result)}, expected five values: observation, reward, terminated, "
-            "truncated, info. Environments of the old gym API (four values) must be ported to Gymnasium 1.x"
-        )
-    _, reward, terminated, truncated, info = result
-    if isinstance(reward, str | bytes | None) or np.ndim(reward) != 0:
-        raise ApiBreak(f"the reward is {reward!r}, expected one number")
-    for name, flag in (("terminated", terminated), ("truncated", truncated)):
-        if not isinstance(flag, bool | np.bool_ | int):
-            raise ApiBreak(f"{name} is {flag!r}, expected True or False")
-    if not isinstance(info, dict):
-        raise ApiBreak(f"info is {describe(info)}, expected a dict")
-
-
 def check_finite(what: str, numbers: Any) -> None:
     """ApiBreak for the first NaN or infinity."""
     good = np.isfinite(numbers)

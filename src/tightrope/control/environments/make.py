@@ -96,7 +96,8 @@ def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> 
     if backend in ("vector", "envpool"):
         if not isinstance(env, str):
             raise ValueError(
-                f"vector backend {backend!r} needs a Gymnasium id; {tasks.name_of(env)} is an object. Use auto."
+                f"vector backend {backend!r} needs a Gymnasium id; {tasks.name_of(env)} is an object. "
+                "Use auto."
             )
         return Backend(backend)
     if backend == "serial":
@@ -144,6 +145,8 @@ def _given(env: Any, num_envs: int | None, backend: str, policy: FaultPolicy) ->
             f"vector backend {backend!r} asked for, but a vector environment was given. Use auto."
         )
     envpool = not isinstance(env, gym.vector.VectorEnv)
-    environments = VectorEnvironments(lambda seed: env, tasks.name_of(env), policy, keep=True, int32_actions=envpool)
+    environments = VectorEnvironments(
+        lambda seed: env, tasks.name_of(env), policy, keep=True, int32_actions=envpool
+    )
     environments.max_episode_steps = tasks.time_limit(env)
     return environments

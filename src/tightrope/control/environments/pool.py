@@ -23,7 +23,7 @@ import gymnasium as gym
 import numpy as np
 
 from tightrope.control.environments import state as states
-from tightrope.control.environments.base import Environments, Step, StepBuffers
+from tightrope.control.environments.base import Environments, Step
 from tightrope.control.environments.faults import (
     RAISED,
     EnvironmentFault,
@@ -32,7 +32,7 @@ from tightrope.control.environments.faults import (
     seed_of,
     wait_before_restart,
 )
-from tightrope.control.environments.group import EnvGroup
+from tightrope.control.environments.group import EnvGroup, StepBuffers
 from tightrope.control.environments.processes import (
     BROKEN,
     CLOSE,
@@ -160,8 +160,9 @@ class EnvironmentPool(Environments):
         step = self._buffers.step(self._has_masks)
         return step.inputs, step.action_mask
 
-    def _send(self, rows: slice, actions: np.ndarray) -> None:
-        self._buffers.actions[rows] = actions
+    def send(self, rows: slice, actions: np.ndarray) -> None:
+        """See Environments."""
+        self._buffers.actions[rows] = self.action_layout.squashed(actions) if self.squash else actions
         if rows.stop > self._bounds[1]:
             for worker in self._workers:
                 worker.send(STEP)

@@ -76,41 +76,32 @@ def alike(found: Any, like: Any) -> bool:
     return found is None and like is None
 
 
-def _layers(env: gym.Env) -> tuple[list[TimeLimit], Any] | None:
+def _stateful(env: Any) -> tuple[list[TimeLimit], Any] | None:
     """The time limits around the layer that gives a state, and that layer; None where there is none, or where
-    a wrapper outside it has a state that nobody knows.
+    a wrapper outside it has a state of its own.
     """
     limits: list[TimeLimit] = []
-    layer: Any = env
-    while not (callable(getattr(layer, GET, None)) and callable(getattr(layer, SET, None))):
-        if isinstance(layer, TimeLimit):
-            limits.append(layer)
-        elif not isinstance(layer, OrderEnforcing | PassiveEnvChecker):
+    while not (callable(getattr(env, GET, None)) and callable(getattr(env, SET, None))):
+        if isinstance(env, TimeLimit):
+            limits.append(env)
+        elif not isinstance(env, OrderEnforcing | PassiveEnvChecker):
             return None
-        layer = layer.env
-    return limits, layer
-
-
-def _given(env: gym.Env) -> tuple[list[TimeLimit], Any]:
-    found = _layers(env)
-    assert found is not None, "asked for a state that it cannot give"
-    return found
+        env = env.env
+    return limits, env
 
 
 def gives_state(env: Any) -> bool:
     """Whether a single or a vector environment can give its state."""
-    if isinstance(env, gym.Env):
-        return _layers(env) is not None
-    return callable(getattr(env, GET, None)) and callable(getattr(env, SET, None))
+    return _stateful(env) is not None
 
 
 def state_of(env: Any) -> Any:
     """The packed state of an environment that gives one. TypeError as `pack`."""
-    if not isinstance(env, gym.Env):
-        return pack({"own": env.get_state()})
-    limits, layer = _given(env)
+    layers = _stateful(env)
+    assert layers is not None
+    limits, layer = layers
     found = {"own": layer.get_state(), "elapsed": [limit._elapsed_steps for limit in limits]}
-    rng = getattr(env.unwrapped, "_np_random", None)
+    rng = getattr(env.unwrapped, "_np_random", None) if isinstance(env, gym.Env) else None
     if isinstance(rng, np.random.Generator):
         found["rng"] = rng.bit_generator.state
     return pack(found)
@@ -118,13 +109,12 @@ def state_of(env: Any) -> Any:
 
 def put_back(env: Any, packed: Any) -> None:
     """Give an environment, which has been reset, the state that `state_of` found."""
-    state = unpack(packed)
-    if not isinstance(env, gym.Env):
-        env.set_state(state["own"])
-        return
-    limits, layer = _given(env)
+    layers, state = _stateful(env), unpack(packed)
+    assert layers is not None
+    limits, layer = layers
     layer.set_state(state["own"])
-    for limit, elapsed in zip(limits, state["elapsed"], strict=True):
+    # "elapsed" is missing for vector environments of older runs
+    for limit, elapsed in zip(limits, state.get("elapsed", ()), strict=True):
         limit._elapsed_steps = elapsed
     if "rng" in state:
         env.unwrapped.np_random.bit_generator.state = state["rng"]

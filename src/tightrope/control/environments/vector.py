@@ -156,8 +156,9 @@ class VectorEnvironments(Environments):
             self._in_call = False
         return inputs, masks
 
-    def _send(self, rows: slice, actions: np.ndarray) -> None:
-        self._actions = actions
+    def send(self, rows: slice, actions: np.ndarray) -> None:
+        """See Environments."""
+        self._actions = self.action_layout.squashed(actions) if self.squash else actions
 
     def receive(self) -> Step:
         """Step all rows with the actions sent; after a fault all episodes are cut."""
@@ -204,12 +205,12 @@ class VectorEnvironments(Environments):
             self._ended = terminated | truncated
             self._any_ended = _any(self._ended)
             masks = self._masks(observations, infos, self._ended)
-            return Step(inputs, masks, rewards, terminated, truncated, phantom)
+            return Step(inputs, masks, rewards, terminated, truncated, phantom=phantom)
         if self.mode == AutoresetMode.SAME_STEP:
             rows = np.flatnonzero(truncated) if _any(truncated) else None
             finals = None if rows is None else self._final_inputs(infos, rows)
             masks = self._masks(observations, infos, None)
-            return Step(inputs, masks, rewards, terminated, truncated, None, rows, finals)
+            return Step(inputs, masks, rewards, terminated, truncated, final_rows=rows, final_inputs=finals)
         masks = self._masks(observations, infos, terminated | truncated)
         return self._reset_ended(Step(inputs, masks, rewards, terminated, truncated))
 

@@ -37,8 +37,8 @@ class Distribution:
     mask: Tensor | None = None
     half_range: Tensor | None = None
 
-    def sample(self, noise: Tensor) -> Tensor:
-        """Actions [N, A] made of the given noise [N, A]."""
+    def sample(self, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [N, A] made of the given noise [N, A], and their log-probabilities [N]."""
         parts = []
         for component in self.layout.components:
             u = noise[:, component.column : component.column + component.width]
@@ -49,7 +49,8 @@ class Distribution:
                 parts.append((u < torch.sigmoid(self._logits(component))).float())
             else:
                 parts.append(_inverse_cdf(self._logits(component), u[:, 0])[:, None].float())
-        return torch.cat(parts, dim=1)
+        actions = torch.cat(parts, dim=1)
+        return actions, self.logp(actions)
 
     def mode(self) -> Tensor:
         """The most likely action [N, A] (Gaussian: the mean, squashed or not)."""

@@ -111,11 +111,16 @@ class Normalisers:
             return inputs
         return {**inputs, "flat": self.observations(inputs["flat"])}
 
-    def start(self, rollout: Any) -> None:
-        """Give the reward normaliser its first statistics: the first rollout is scaled by its own."""
-        if self.rewards is not None and float(self.rewards.moments.count) == 0:
+    def scaled_rewards(self, rollout: Any) -> Array:
+        """The rewards of a rollout to learn from, float32. The first rollout of all is scaled by its own
+        statistics: there are no others.
+        """
+        if self.rewards is None:
+            return rollout.rewards.astype(np.float32)
+        if float(self.rewards.moments.count) == 0:
             self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
             rollout.reward_statistics_taken = True
+        return self.rewards(rollout.rewards)
 
     def update(self, rollout: Any) -> None:
         """Move the statistics, after the update on this rollout."""

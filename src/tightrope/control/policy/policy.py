@@ -131,9 +131,10 @@ class Policy(nn.Module):
         """Where the parameters lie."""
         return next(self.parameters()).device
 
-    def tensors(self, arrays: dict[str, np.ndarray]) -> Inputs:
+    def _tensors(self, arrays: dict[str, np.ndarray]) -> Inputs:
         """Encoded observations as tensors where the parameters lie."""
-        return {name: torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for name, x in arrays.items()}
+        device = self.device
+        return {name: torch.from_numpy(np.ascontiguousarray(x)).to(device) for name, x in arrays.items()}
 
     def critic_parameters(self) -> list[nn.Parameter]:
         """The parameters that only the critic uses; empty for a user's own module."""
@@ -158,8 +159,10 @@ class Policy(nn.Module):
         parameters = self.actor[-1](latent)
         return self._distribution(parameters, latent, inputs), self.critic(features)[:, 0]
 
-    def values(self, inputs: Inputs) -> Tensor:
-        """Values [N] alone."""
+    @torch.no_grad()
+    def values(self, arrays: dict[str, np.ndarray]) -> Tensor:
+        """Only the values [N] of encoded observations [N, ...]."""
+        inputs = self._tensors(arrays)
         if self.own is not None:
             return self._own_outputs(inputs)[1]
         assert self.critic is not None
@@ -173,34 +176,37 @@ class Policy(nn.Module):
         return self.trunk(x) if self.trunk is not None else x
 
     @torch.no_grad()
-    def act(self, inputs: Inputs, noise: Tensor, rows: slice = slice(None)) -> tuple[Tensor, Tensor]:
-        """Sampled actions [N, A] and their log-probabilities [N]; with gSDE the held exploration makes the
-        noise.
+    def act(
+        self, arrays: dict[str, np.ndarray], noise: np.ndarray, rows: slice = slice(None)
+    ) -> tuple[Tensor, Tensor]:
+        """Sampled actions [N, A] and their log-probabilities [N], from encoded observations and noise [N, A].
+
+        With gSDE the held exploration of these rows makes the noise of Gaussian columns.
         """
-        distribution, latent = self._actor(inputs)
+        distribution, latent = self._actor(self._tensors(arrays))
+        random = torch.from_numpy(noise).to(self.device)
         if self.gsde and self.exploration is not None:
             assert latent is not None and self.log_std is not None and distribution.log_std is not None
             held = torch.einsum(
                 "nf,nfd->nd", latent, self.exploration[rows] * self.log_std.clamp(-20, 2).exp()
             )
-            noise = noise.clone()
-            noise[:, self._gaussian_columns()] = held * (-distribution.log_std).exp()
-        actions = distribution.sample(noise)
-        return actions, distribution.logp(actions)
+            random = random.clone()
+            random[:, self._gaussian_columns()] = held * (-distribution.log_std).exp()
+        return distribution.sample(random)
 
-    def sample(self, inputs: Inputs, noise: Tensor, rng: np.random.Generator) -> Tensor:
+    def sample(self, arrays: dict[str, np.ndarray], noise: np.ndarray, rng: np.random.Generator) -> Tensor:
         """Sampled actions [N, A] outside a rollout: fresh exploration, and the held one is left as it is."""
         held = self.exploration
         self.hold_exploration(len(noise), rng)
         try:
-            return self.act(inputs, noise)[0]
+            return self.act(arrays, noise)[0]
         finally:
             self.exploration = held
 
     @torch.no_grad()
-    def mode(self, inputs: Inputs) -> Tensor:
+    def mode(self, arrays: dict[str, np.ndarray]) -> Tensor:
         """The most likely actions [N, A]."""
-        return self._actor(inputs)[0].mode()
+        return self._actor(self._tensors(arrays))[0].mode()
 
     def hold_exploration(self, num_envs: int, rng: np.random.Generator) -> None:
         """Draw the gSDE matrices [num_envs, features, d] that are held for the next ``gsde_steps`` steps."""

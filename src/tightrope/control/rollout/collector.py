@@ -6,13 +6,20 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from torch import nn
 
-from tightrope.control.engine.base import Engine
+from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
+from tightrope.control.engine.base import Acted, Engine
 from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments
+from tightrope.control.environments.faults import action_text, circumstances
 from tightrope.control.policy.normalise import Normalisers
-from tightrope.control.rollout.rollout import Array, Rollout, check_numbers, check_policy
+from tightrope.control.rollout.rollout import Array, Rollout
 from tightrope.control.spaces import Inputs
+
+
+class BadNumbers(ValueError):
+    """An environment returned a NaN or an infinity; nothing was learned from it."""
 
 
 def reset_seed(seed: int, step: int) -> int:
@@ -92,8 +99,7 @@ class Collector:
     def collect(self, engine: Engine, num_steps: int) -> Rollout:
         """Step all environments ``num_steps`` times with the engine's policy.
 
-        The next call reuses the arrays of the rollout that it returns. The first rollout of all also starts
-        the reward normaliser, which has nothing else to scale it by.
+        The next call reuses the arrays of the rollout that it returns.
         """
         rollout = self._cleared(num_steps)
         try:
@@ -112,7 +118,6 @@ class Collector:
             self._restarts = self.environments.restarts
         rollout.episodes = self._count_episodes(rollout)
         self._step_count += num_steps
-        self.normalisers.start(rollout)
         return rollout
 
     def _cleared(self, num_steps: int) -> Rollout:
@@ -138,7 +143,8 @@ class Collector:
             if normaliser is not None:
                 rollout.raw[:, t] = inputs["flat"]
             for rows in environments.row_groups:
-                out = rollout.acted(rows, t)
+                seen = {name: x[rows, t] for name, x in rollout.inputs.items()}
+                out = Acted(seen, rollout.actions[rows, t], rollout.logp[rows, t])
                 engine.act(inputs, normaliser, action_mask, noise[t], rows, out)
                 environments.send(rows, out.actions)
             before = perf_counter()
@@ -184,3 +190,56 @@ class Collector:
             self._returns[row] -= totals[-1]
             self._lengths[row] -= counts[-1]
         return [episode[1:] for episode in sorted(found, key=lambda episode: episode[0])]
+
+
+# --------------------------------------------------------------------------------------------------- checks
+
+
+def check_numbers(
+    rollout: Rollout, environments: Environments, last: Inputs, num_steps: int, first_step: int
+) -> None:
+    """Raise BadNumbers for the first NaN or infinity that an environment returned in ``num_steps`` columns.
+
+    ``last``: observations after the last step, as they came. ``first_step``: number of the first column.
+    """
+    rows = np.arange(len(rollout.logp))
+    # what, numbers [N, t, k], their rows, the step of the first, the column of the action that led there
+    checks = [("observation", rollout.raw[:, :num_steps], rows, first_step, -1)]
+    checks.append(("reward", rollout.rewards[:, :num_steps, None], rows, first_step, 0))
+    if "flat" in last:
+        checks.append(("observation", last["flat"][:, None], rows, first_step + num_steps, num_steps - 1))
+    for t, final_rows, x in rollout.finals:
+        if "flat" in x:
+            checks.append(("final observation", x["flat"][:, None], final_rows, first_step + t + 1, t))
+    for what, numbers, which, first, column in checks:
+        good = np.isfinite(numbers)
+        if good.all():
+            continue
+        place, t, index = np.argwhere(~good)[0]
+        row = int(which[place])
+        where = f"step {first + t}" + ("" if what == "reward" else f", index {index}")
+        action = None
+        if column + t >= 0:
+            chosen = rollout.actions[row, column + t]
+            action = action_text(environments.action_layout.to_env_single(chosen, environments.squash))
+        raise BadNumbers(
+            f"Environment {row} of {environments.spec_id} returned {what} = {numbers[place, t, index]} at "
+            f"{where}{circumstances(environments.worker_of(row), environments.seed_of(row), action)}; "
+            "expected finite numbers. The policy was not updated with it. Fix the environment, or clip and "
+            "check its state there; --on-env-fault restart restarts it and continues."
+        )
+
+
+def check_policy(rollout: Rollout, policy: nn.Module, num_steps: int, first_step: int) -> None:
+    """NonFiniteError when the policy gave a log-probability that is not finite; a bad weight is named."""
+    bad = ~np.isfinite(rollout.logp[:, :num_steps])
+    if not bad.any():
+        return
+    row, t = np.argwhere(bad)[0]
+    weight = first_bad((f"the weight {name}", p) for name, p in policy.named_parameters())
+    raise NonFiniteError(
+        f"The policy gave the log-probability {rollout.logp[row, t]} to its action in environment {row} at "
+        f"step {first_step + t}; expected a finite number"
+        + (f", but {weight}. " if weight else ": its logits overflow. ")
+        + "It was not updated with this rollout. Look for a learning rate that is too high."
+    )
