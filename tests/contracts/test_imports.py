@@ -31,7 +31,8 @@ MAY_IMPORT = {
     "control.environments": CORE | {"control.spaces"},
     "control.policy": CORE | {"control.spaces", "control.settings"},
     "control.engine.compiled": CORE,
-    "control.engine": CORE | {"control.policy", "control.engine.compiled", "control.settings"},
+    "control.engine": CORE
+    | {f"control.{part}" for part in ("spaces", "policy", "engine.compiled", "settings")},
     "control.rollout": CORE | {"control.spaces", "control.environments", "control.policy", "control.engine"},
     "control": CORE
     | {"training"}

@@ -339,7 +339,7 @@ class Keeper(Frail):
         (
             "hang get",
             "serial",
-            r"the state of environment 3 .* cannot be kept: Overdue: not back after 0.5 s",
+            r"the state of environment 3 .* cannot be kept: EnvironmentTimeout: not back after 0.5 s",
         ),
     ],
 )

@@ -158,7 +158,7 @@ def check_first_ratios(log_ratio: Tensor, limit: float | None) -> None:
     if limit is None:
         return
     worst = float(log_ratio.abs().max())
-    if math.isfinite(worst) and worst > limit:  # what is not finite is named before the step
+    if math.isfinite(worst) and worst > limit:  # the check before the step names other numbers
         raise SamplingMismatch(
             f"Before any update the log-probabilities differ by {worst:.3g} from those that sampled (limit "
             f"{limit:g}). Sampling and training disagree. Likely causes: dropout or batch normalisation left "
@@ -178,7 +178,7 @@ class Meter:
     extremes: dict[str, Tensor] = field(default_factory=dict)
 
     def copy(self) -> Meter:
-        """The same sums in a meter of their own."""
+        """Another meter with the same sums."""
         return Meter(dict(self.sums), dict(self.counts), dict(self.extremes))
 
     def add(self, mask: Tensor, **per_step: Tensor | tuple[Tensor, float]) -> dict[str, Tensor]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-SIGNS = ("out of memory", "not enough memory", "defaultcpuallocator")  # what torch's RuntimeErrors say
+SIGNS = ("out of memory", "not enough memory", "defaultcpuallocator")  # in the texts of torch's RuntimeErrors
 
 
 class OutOfMemory(RuntimeError):
@@ -25,13 +25,13 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def free() -> None:
-    """Give back what torch holds of a GPU's memory and does not use."""
+    """Free the memory of a GPU that torch holds but does not use."""
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
 
 
 def _random_state() -> Callable[[], None]:
-    """Puts the state of torch's own generators, CPU and CUDA, back to what it is now."""
+    """A function that restores the present state of torch's generators, CPU and CUDA."""
     cpu = torch.get_rng_state()
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
 
@@ -79,7 +79,7 @@ class MicroBatches:
             start_over()
 
     def metrics(self) -> dict[str, float]:
-        """The size in force and how often it was halved; nothing while memory was enough."""
+        """The present size and how often it was halved; nothing while memory was enough."""
         if not self.halvings:
             return {}
         return {

@@ -21,8 +21,8 @@ from tightrope.algorithms.optimise import (
     set_learning_rates,
 )
 from tightrope.algorithms.settings import PPOSettings
-from tightrope.control.engine import choose as engines
 from tightrope.control.engine.base import limited_threads
+from tightrope.control.engine.choose import choose_engine, usable_device
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
@@ -34,13 +34,12 @@ from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.rollout import Rollout, to_batch
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import ObservationLayout
+from tightrope.control.spaces import Array, Inputs, ObservationLayout
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint
 from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors
 
-Array = np.ndarray
 MIN_COLUMNS = 16  # ten epochs on fewer steps than this would only add noise to a finished policy
 
 
@@ -67,7 +66,7 @@ class Agent:
         self.env = env
         self.environments = _environments(env, self.settings)
         present = self.settings
-        torch_device = engines.usable_device(present.device)
+        torch_device = usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
         threads = present.threads or (available_cores() if layouts[0].image_shapes else 1)
         with limited_threads(threads):  # the QR of the first weights rounds differently with more threads
@@ -77,7 +76,7 @@ class Agent:
         )
         self.normalisers = _normalisers(self.environments, present)
         self.cores = available_cores()
-        self.engine, self.engine_line = engines.choose(
+        self.engine, self.engine_line = choose_engine(
             self.policy, self.optimiser, present, self.cores, notify
         )
         # three streams: what predict draws must not change what training draws
@@ -100,7 +99,7 @@ class Agent:
         return self
 
     def iterate(self, total_steps: int | None = None, *, start: int | None = None) -> Iterator[Update]:
-        """The same, one update at a time: ``for report in agent.iterate(n): ...``.
+        """Learn, one update at a time: ``for report in agent.iterate(n): ...``.
 
         ``start``: the agent step at which this budget began (default: now).
         """
@@ -111,7 +110,7 @@ class Agent:
             if self.fresh:
                 self.collector.reset(self.settings.seed, self.steps)
             before = self.steps - start
-            # beside the engine's own two threads BLAS threads only spin: its products are too small to share
+            # BLAS threads beside the engine's two only spin: its products are too small to share
             with limited_threads(1 if self.engine.name == "fused" else self.settings.threads or 1):
                 metrics, episodes = self._one_update(columns, (self.steps - start) / budget, check=first)
             first, after = False, self.steps - start
@@ -182,17 +181,10 @@ class Agent:
         """
         layout, actions = self.environments.observation_layout, self.environments.action_layout
         batched = _is_batched(layout, observation)
-        inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
-        rows = len(next(iter(inputs.values())))
-        masks = layout.mask_of(observation) if action_masks is None and layout.has_mask else action_masks
-        action_mask = flat_mask(masks, rows, actions)
-        if action_mask is not None:
-            inputs = {**inputs, "action_mask": action_mask}
-        if deterministic:
-            chosen = self.policy.mode(inputs)
-        else:
-            chosen = self.policy.sample(inputs, self.noise(rows, self.predict_rng), self.predict_rng)
-        matrix = chosen.cpu().numpy()
+        inputs = layout.encode(observation, batched=batched)
+        masks = layout.mask_of(observation) if action_masks is None else action_masks
+        action_mask = flat_mask(masks, len(next(iter(inputs.values()))), actions)
+        matrix = self.choose(inputs, action_mask, None if deterministic else self.predict_rng)
         squash = self.settings.squash
         return (actions.to_env(matrix, squash) if batched else actions.to_env_single(matrix[0], squash)), None
 
@@ -202,19 +194,28 @@ class Agent:
         batched = _is_batched(layout, observation)
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
         values = self.policy.values(inputs).cpu().numpy()
-        values = values * (
-            self.normalisers.rewards.deviation if self.normalisers.rewards is not None else 1.0
-        )
+        if self.normalisers.rewards is not None:
+            values = values * self.normalisers.rewards.deviation
         return values if batched else float(values[0])
 
-    def noise(self, rows: int, rng: np.random.Generator) -> Array:
-        """Noise [rows, A] for Policy.act."""
-        return self.collector.noise(1, rows, rng)[0]
+    def choose(
+        self, inputs: Inputs, action_mask: Array | None, rng: np.random.Generator | None = None
+    ) -> Array:
+        """Action matrix [N, A] for observations as their layout encodes them: sampled with ``rng``, without
+        it the most likely actions. ``action_mask`` bool [N, L].
+        """
+        inputs = self.normalisers.encode(inputs)
+        if action_mask is not None:
+            inputs = {**inputs, "action_mask": action_mask}
+        if rng is None:
+            return self.policy.mode(inputs).cpu().numpy()
+        noise = self.collector.noise(1, len(next(iter(inputs.values()))), rng)[0]
+        return self.policy.sample(inputs, noise, rng).cpu().numpy()
 
     # ------------------------------------------------------------------------------------- moving and saving
 
     def set_env(self, env: Any) -> Agent:
-        """Go on learning on another environment with the same spaces (a warm start).
+        """Continue on another environment with the same spaces (a warm start).
 
         Raises ValueError, with nothing changed, when the spaces differ.
         """
@@ -341,14 +342,14 @@ AGENTS: dict[str, type[Agent]] = {"ppo": PPO, "a2c": A2C, "reinforce": Reinforce
 
 
 def anywhere(settings: TrainSettings) -> TrainSettings:
-    """The same settings with the choice of who steps the environments open again: for another environment."""
+    """The settings for another environment: who steps it is chosen again."""
     return dataclasses.replace(settings, vector_backend="auto", num_workers=None)
 
 
 def _resolved(
     settings: TrainSettings, environments: Environments, engine: str, threads: int | None
 ) -> TrainSettings:
-    """The settings with everything filled in that was left to choose: what settings.json holds."""
+    """The settings with every choice that was made, as settings.json holds them."""
     given, workers = environments.backend == "given", environments.backend == "workers"
     return dataclasses.replace(
         settings,
@@ -380,7 +381,7 @@ def _normalisers(environments: Environments, settings: TrainSettings) -> Normali
 
 
 def _is_batched(layout: ObservationLayout, observation: Any) -> bool:
-    """Whether an observation has one axis more than the space says."""
+    """Whether an observation has one axis more than its space."""
     leaf = layout.leaves[0]
     for key in leaf.path:
         observation = observation[key]

@@ -13,7 +13,6 @@ from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
 from tightrope.control.settings import EVALUATION_SEED
 
-Array = np.ndarray
 MAX_COPIES = 10
 
 
@@ -33,17 +32,14 @@ def evaluate_agent(
     """
     rows = environments.num_envs
     share = np.array([episodes // rows + (i < episodes % rows) for i in range(rows)])
-    rng = np.random.default_rng([seed, 3])
+    rng = None if deterministic else np.random.default_rng([seed, 3])
     inputs, action_mask = environments.reset(seed)
     totals, lengths = np.zeros(rows), np.zeros(rows, np.int64)
     found: list[tuple[float, int]] = []
     while share.any():
-        actions = act(agent, inputs, action_mask, None if deterministic else rng)
-        step = environments.step(actions)
+        step = environments.step(agent.choose(inputs, action_mask, rng))
         real = np.ones(rows, bool) if step.phantom is None else ~step.phantom
-        if (
-            step.cut is not None
-        ):  # an episode that a fault cut counts for nothing; another one takes its place
+        if step.cut is not None:  # an episode that a fault cut does not count; another one takes its place
             real &= ~step.cut
             totals[step.cut], lengths[step.cut] = 0.0, 0
         totals += np.where(real, step.rewards, 0.0)
@@ -55,20 +51,6 @@ def evaluate_agent(
             totals[row], lengths[row] = 0.0, 0
         inputs, action_mask = step.inputs, step.action_mask
     return _summary(found)
-
-
-def act(
-    agent: Any, inputs: dict[str, Array], action_mask: Array | None, rng: np.random.Generator | None
-) -> Array:
-    """Action matrix [N, A] for raw encoded inputs; ``rng`` None: the most likely actions."""
-    inputs = agent.normalisers.encode(inputs)
-    if action_mask is not None:
-        inputs = {**inputs, "action_mask": action_mask}
-    policy = agent.policy
-    if rng is None:
-        return policy.mode(inputs).cpu().numpy()
-    rows = len(next(iter(inputs.values())))
-    return policy.sample(inputs, agent.noise(rows, rng), rng).cpu().numpy()
 
 
 def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:

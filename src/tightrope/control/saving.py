@@ -82,7 +82,7 @@ def evaluate_run(
 
 
 def name_again(path: str | Path, env: str, command: str) -> str:
-    """What to type about a run whose task is the user's own code: no file may say what is imported."""
+    """The command to type for a run whose task is the user's code: a file must not name what is imported."""
     registered = "" if ":" in env else " --env-module FILE.py"
     words = f"tightrope {command} {shlex.quote(str(path))} --env {retyped(env, 'ID')}{registered}"
     return (

@@ -65,7 +65,7 @@ def resume(
     policy: Any = None,
 ) -> dict[str, Any]:
     """Continue from the newest checkpoint, or from the start where there is none yet; the end is that of an
-    uninterrupted run, bit for bit (docs/resume.md says what that takes).
+    uninterrupted run, bit for bit (docs/resume.md names the conditions).
 
     ``total_steps`` extends a finished run: schedules and grid run over the new budget from here on.
     """
@@ -85,8 +85,8 @@ def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, p
         raise ValueError(name_again(run_dir, settings.env, "resume"))
     if own_policy and policy is None:
         raise ValueError(
-            f"{run_dir} holds a policy module of somebody's own, which no file may import. Go on in Python: "
-            f"tightrope.control.train.resume({str(run_dir)!r}, policy=module)."
+            f"{run_dir} holds a policy module of somebody's own, which no file may import. Continue in "
+            f"Python: tightrope.control.train.resume({str(run_dir)!r}, policy=module)."
         )
     # of a run that was extended and stopped before its next checkpoint, only settings.json has the budget
     if total_steps is None:
@@ -103,7 +103,7 @@ def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, p
             learner.restore(point)
         continue_from(learner, run, point)
         if learner.complete:
-            listeners.info(f"{run_dir} has its {learner.total} steps; --total-steps N goes on from there.")
+            listeners.info(f"{run_dir} has its {learner.total} steps; --total-steps N continues from there.")
         return loop.train(learner, run, listeners)
 
 
@@ -139,7 +139,7 @@ class AgentLearner:
 
     @property
     def complete(self) -> bool:
-        """Whether the budget is spent: what is left is less than one step in every environment."""
+        """Whether fewer steps are left than one in every environment."""
         return self.position + self.settings.num_envs > self.total
 
     @property
@@ -166,7 +166,7 @@ class AgentLearner:
             self.listeners.info(f"no evaluation while training: {error}")
             return
         if self._environments.gives_state:
-            # what a copy keeps from one evaluation to the next must not change what a resumed run sees
+            # a resumed run must see the same evaluations, whatever a copy keeps from one to the next
             self._environments.reset(EVALUATION_SEED)
             self._first_state = self._environments.get_state()
 
@@ -190,7 +190,7 @@ class AgentLearner:
     def _evaluate(self) -> dict[str, float]:
         if self._environments is None:
             return {}
-        # restarts in evaluations must not count towards the limit: a resumed run has not seen them
+        # restarts in evaluations must not count towards the limit: a resumed run does not know of them
         self._environments.count_from(0)
         if self._first_state is not None:
             self._environments.set_state(self._first_state)
@@ -205,13 +205,13 @@ class AgentLearner:
         }
 
     def _keep(self, mean: float) -> None:
-        """Save the policy as the best; where the disk refuses, the best one is still the one before."""
+        """Save the policy as the best. If it cannot be written, the one before stays the best."""
         try:
             with signals.whole():
                 self.agent.save(self.run.best)
         except CannotWrite as error:
             self.listeners.warn(
-                f"The best policy is not saved: {error.what} {error.advice}. Training goes on."
+                f"The best policy is not saved: {error.what} {error.advice}. Training continues."
             )
         else:
             self.best = mean

@@ -89,8 +89,8 @@ def discounted_returns(
     """Discounted sums of the rewards to come, [B, T].
 
     G_t = r_t + gamma * G_{t+1}; where `ended` and in the last column G_t = r_t + gamma * bootstrap_t; 0 where
-    masked, and a masked step hands nothing back. `bootstrap` [B, T] is the value of the state after the step
-    and is read at those cuts alone: give 0 where the step terminated, V(s_{t+1}) where it was truncated or
+    masked, and a masked step passes nothing back. `bootstrap` [B, T] is the value of the state after the step
+    and is read only at those cuts: give 0 where the step terminated, V(s_{t+1}) where it was truncated or
     cut. None means 0 everywhere. ValueError when the shapes differ.
     """
     require_same_shape(rewards=rewards, ended=ended, bootstrap=bootstrap, mask=mask)

@@ -13,8 +13,8 @@ from threadpoolctl import ThreadpoolController
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import UpdateSettings
 from tightrope.control.policy.normalise import ObservationNormaliser
+from tightrope.control.spaces import Array, Inputs
 
-Array = np.ndarray
 _controller: ThreadpoolController | None = None
 
 
@@ -24,7 +24,7 @@ class Acted(NamedTuple):
     The caller provides them because the compiled engine writes in place, which saves a copy.
     """
 
-    inputs: dict[str, Array]  # [N, ...]: the observations as the policy saw them (normalised)
+    inputs: Inputs  # [N, ...]: the observations as the policy saw them (normalised)
     actions: Array  # float32 [N, A]
     logp: Array  # float32 [N]: log-probability of these actions
 
@@ -60,7 +60,7 @@ class Engine(Protocol):
 
     def act(
         self,
-        inputs: dict[str, Array],
+        inputs: Inputs,
         normaliser: ObservationNormaliser | None,
         action_mask: Array | None,
         noise: Array,
@@ -72,7 +72,7 @@ class Engine(Protocol):
         ``action_mask`` bool [B, L]. ``noise`` [B, A]: uniform for categories and bits, normal for Gaussians.
         """
 
-    def values(self, inputs: dict[str, Array]) -> Array:
+    def values(self, inputs: Inputs) -> Array:
         """Values [N] of encoded observations [N, ...]."""
 
     def gae(self, steps: Steps, gamma: float, gae_lambda: float) -> Array:
@@ -97,7 +97,7 @@ class Engine(Protocol):
 
 @contextmanager
 def limited_threads(threads: int) -> Iterator[None]:
-    """Torch and BLAS use at most ``threads`` threads inside; the user's own numbers return afterwards.
+    """Torch and BLAS use at most ``threads`` threads inside; the numbers from before return afterwards.
 
     A minibatch of 64 rows is too small to share, and idle BLAS threads spin.
     """

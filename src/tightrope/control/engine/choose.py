@@ -23,7 +23,7 @@ def usable_device(name: str) -> torch.device:
     return device
 
 
-def choose(
+def choose_engine(
     policy: Policy,
     optimiser: torch.optim.Optimizer,
     settings: TrainSettings,

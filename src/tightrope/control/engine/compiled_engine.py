@@ -16,11 +16,12 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.descent import check_first_ratios
 from tightrope.algorithms.nonfinite import NonFiniteError, explain
 from tightrope.algorithms.settings import PPOSettings, UpdateSettings
-from tightrope.control.engine.base import Acted, Array, Steps
+from tightrope.control.engine.base import Acted, Steps
 from tightrope.control.engine.compiled import cache, infer, plan, threads
 from tightrope.control.engine.compiled import update as kernels
 from tightrope.control.policy.normalise import CLIP, ObservationNormaliser
 from tightrope.control.policy.policy import Policy
+from tightrope.control.spaces import Array, Inputs
 
 cache.mark_complete()  # importing infer and update has compiled or loaded every entry
 
@@ -108,7 +109,7 @@ class CompiledEngine:
 
     def act(
         self,
-        inputs: dict[str, Array],
+        inputs: Inputs,
         normaliser: ObservationNormaliser | None,
         action_mask: Array | None,
         noise: Array,
@@ -128,7 +129,7 @@ class CompiledEngine:
             inverse_std, CLIP, masks, noise[rows], out.actions, out.logp, out.inputs["flat"],
         )  # fmt: skip
 
-    def values(self, inputs: dict[str, Array]) -> Array:
+    def values(self, inputs: Inputs) -> Array:
         """See Engine."""
         flat = _float(inputs["flat"])
         out = np.empty(len(flat), np.float32)

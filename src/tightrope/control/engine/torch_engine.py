@@ -11,10 +11,11 @@ import torch
 from tightrope.algorithms import a2c, ppo, reinforce
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import UpdateSettings
-from tightrope.control.engine.base import Acted, Array, Steps
+from tightrope.control.engine.base import Acted, Steps
 from tightrope.control.policy.normalise import ObservationNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.settings import TrainSettings
+from tightrope.control.spaces import Array, Inputs
 from tightrope.maths import returns
 
 ALGORITHMS = {"ppo": ppo, "a2c": a2c, "reinforce": reinforce}
@@ -46,7 +47,7 @@ class TorchEngine:
 
     def act(
         self,
-        inputs: dict[str, Array],
+        inputs: Inputs,
         normaliser: ObservationNormaliser | None,
         action_mask: Array | None,
         noise: Array,
@@ -68,7 +69,7 @@ class TorchEngine:
         out.logp[:] = logp.cpu().numpy()
 
     @torch.no_grad()
-    def values(self, inputs: dict[str, Array]) -> Array:
+    def values(self, inputs: Inputs) -> Array:
         """See Engine."""
         total = len(next(iter(inputs.values())))
         size = IMAGES_AT_ONCE if any(name.startswith("image") for name in inputs) else total

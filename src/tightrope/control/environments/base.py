@@ -29,7 +29,7 @@ class Environments(ABC):
     """B environments of one task. Made by ``make_environments``; close it, or use it in a ``with`` statement.
 
     After an EnvironmentFault only ``close`` is allowed. ``row_groups``: slices of rows, in the order in which
-    to choose their actions, so that choosing the next overlaps with stepping the last.
+    to choose their actions: one group is stepped while the actions of the next are chosen.
     """
 
     backend: str  # "serial" | "workers" | "vector" | "envpool" | "given"
@@ -78,7 +78,7 @@ class Environments(ABC):
         """The state in the middle of episodes, as JSON can hold it; EnvironmentFault when it cannot."""
 
     def set_state(self, state: dict[str, Any]) -> tuple[Inputs, np.ndarray | None]:
-        """Reset, and continue from what `get_state` returned; returns what the reset did.
+        """Reset, and continue from a state of `get_state`. Returns what `reset` returned.
 
         ValueError for a seed that no run has.
         """

@@ -18,7 +18,7 @@ import numpy as np
 
 FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
 LONGEST_PAUSE = 2.0
-Result = TypeVar("Result")
+Outcome = TypeVar("Outcome")
 
 
 class EnvironmentFault(RuntimeError):
@@ -67,15 +67,15 @@ class ApiBreak(Exception):
         self.index = index
 
 
-class Overdue(BaseException):
+class EnvironmentTimeout(BaseException):
     """An environment of this process exceeded its time limit.
 
-    A BaseException, so that the environment's own ``except Exception`` does not swallow it.
+    A BaseException: an ``except Exception`` in the environment must not catch it.
     """
 
 
-# what counts as an environment's fault; a signal to this process does not
-RAISED = (Exception, SystemExit, GeneratorExit, Overdue)
+# what counts as a fault of an environment; a signal to this process does not
+RAISED = (Exception, SystemExit, GeneratorExit, EnvironmentTimeout)
 
 
 class FaultPolicy(NamedTuple):
@@ -104,10 +104,10 @@ class Restarts:
     def until_it_works(
         self,
         fault: EnvironmentFault,
-        attempt: Callable[[], Result],
+        attempt: Callable[[], Outcome],
         explain: Callable[[BaseException], EnvironmentFault],
-    ) -> Result:
-        """What ``attempt`` returns, called again after each fault of its own.
+    ) -> Outcome:
+        """Return ``attempt()``, called again after each fault in it.
 
         ``explain`` turns what ``attempt`` raised into a fault, or raises. Raises the last fault when the
         limit is reached.
@@ -166,9 +166,9 @@ def explained(
     action: str | None,
     advice: str = "",
 ) -> EnvironmentFault:
-    """The fault for what ``who`` raised; an error of the environment's own brings its traceback."""
+    """The fault for an error of ``who``; the environment's own errors come with their traceback."""
     api = isinstance(error, ApiBreak)
-    if isinstance(error, Overdue):
+    if isinstance(error, EnvironmentTimeout):
         what = f"was {error}"
     elif api or raised_here(error):
         what = f"does not follow Gymnasium's API: {error}"
@@ -201,7 +201,7 @@ def raised_here(error: BaseException) -> bool:
     return bool(frames) and control in Path(frames[-1].filename).parents
 
 
-def describe(value: Any) -> str:
+def kind_of(value: Any) -> str:
     """A value in a few words for an error message."""
     if isinstance(value, tuple):
         return f"a tuple of {len(value)} values"

@@ -1,6 +1,6 @@
 """Several environments stepped one after the other in one process.
 
-Each is reset in the step in which its episode ends, so that no row is ever wasted; the true final observation
+Each is reset in the step in which its episode ends, so every row is a transition. The true final observation
 of a truncated episode is kept.
 """
 
@@ -24,8 +24,8 @@ from tightrope.control.environments.faults import (
     Restarts,
     action_text,
     check_finite,
-    describe,
     explained,
+    kind_of,
     seed_of,
     wait_before_restart,
 )
@@ -92,7 +92,7 @@ class StepBuffers:
         return StepBuffers(**{field.name: mapped(getattr(self, field.name)) for field in fields(self)})
 
     def step(self, has_masks: bool) -> Step:
-        """A copy of what the last step left here."""
+        """The last step, copied."""
         rows = np.flatnonzero(self.truncated) if self.truncated.any() else None
         return Step(
             inputs={name: array.copy() for name, array in self.inputs.items()},
@@ -204,7 +204,7 @@ class EnvGroup:
 
     def _step_from(self, begin: int, actions: Iterator[Any]) -> int:
         """Step from row ``begin`` on; the row to continue from, behind one that was restarted."""
-        # local names: this loop is the cost of every step
+        # local names are faster, and this loop runs at every step
         buffers, plain, shape, checked = self.buffers, self._plain, self._shape, self._checked
         envs, rewards, flat_rows, current = self.envs, buffers.rewards, self._flat_rows, buffers.current
         has_masks, strict = self.has_masks, self.policy.restart
@@ -336,12 +336,12 @@ class EnvGroup:
 
     def get_state(self) -> list[Any]:
         """The packed state of every environment (see state.py)."""
-        return [self._state_call(row, states.state_of, env) for row, env in enumerate(self.envs)]
+        return [self._state_call(row, states.saved_state, env) for row, env in enumerate(self.envs)]
 
     def set_state(self, found: list[Any]) -> None:
         """Put packed states back into environments that have been reset."""
         for row, (env, state) in enumerate(zip(self.envs, found, strict=True)):
-            self._state_call(row, states.put_back, env, state)
+            self._state_call(row, states.restore_state, env, state)
 
     def _state_call(self, row: int, function: Callable[..., Any], *arguments: Any) -> Any:
         self._calls += 1
@@ -366,17 +366,17 @@ def _check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
     """The pair (observation, info) that ``reset`` returned; ApiBreak when it is something else."""
     if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
         raise ApiBreak(
-            f"reset returned {describe(result)}, expected the pair (observation, info dict). "
+            f"reset returned {kind_of(result)}, expected the pair (observation, info dict). "
             "Environments of the old gym API must be ported to Gymnasium 1.x"
         )
     return result
 
 
 def _check_step(result: Any, has_masks: bool) -> None:
-    """Check the first step of an environment; ApiBreak names what it returned and what was expected."""
+    """Check the first step of an environment. ApiBreak when it does not follow Gymnasium's API."""
     if not isinstance(result, tuple) or len(result) != 5:
         raise ApiBreak(
-            f"step returned {describe(result)}, expected five values: observation, reward, terminated, "
+            f"step returned {kind_of(result)}, expected five values: observation, reward, terminated, "
             "truncated, info. Environments of the old gym API (four values) must be ported to Gymnasium 1.x"
         )
     _, reward, terminated, truncated, info = result
@@ -386,7 +386,7 @@ def _check_step(result: Any, has_masks: bool) -> None:
         if not isinstance(flag, bool | np.bool_ | int):
             raise ApiBreak(f"{name} is {flag!r}, expected True or False")
     if not isinstance(info, dict):
-        raise ApiBreak(f"info is {describe(info)}, expected a dict")
+        raise ApiBreak(f"info is {kind_of(info)}, expected a dict")
     if MASK_KEY in info and not has_masks:
         raise ApiBreak(
             f"step gives info[{MASK_KEY!r}] but reset did not; give it at every reset and every step"

@@ -15,7 +15,7 @@ from tightrope.control.environments.processes import available_cores
 from tightrope.control.environments.vector import VectorEnvironments, is_vector_env
 
 BACKENDS = ("auto", "serial", "workers", "vector", "envpool")
-# A step of these takes tens of microseconds, so that waking a worker pays.
+# A step of these takes tens of microseconds: long enough for a worker process to save time.
 SLOW_MODULES = ("gymnasium.envs.mujoco", "gymnasium.envs.box2d")
 # Numpy: 43 us a step for any small number of environments, against about 7.5 us each one by one.
 NUMPY_VECTOR_IDS = ("CartPole-v0", "CartPole-v1")
@@ -32,10 +32,10 @@ class Backend(NamedTuple):
 def choose_backend(
     env_id: str | None, num_envs: int, num_workers: int | None = None, cores: int = 1
 ) -> Backend:
-    """The backend that ``auto`` means: a function of these arguments, never of a timing.
+    """The backend that ``auto`` means. It depends only on these arguments, never on a timing.
 
     ``env_id`` None: a factory, or an instance without a spec. Asking for more than one worker means workers.
-    Jax versions of a task are never chosen: they would be compiled first.
+    Jax versions of a task are never chosen, because they must be compiled first.
     """
     if num_workers is not None and num_workers > 1 and num_envs > 1:
         return Backend("workers", min(num_workers, num_envs))
@@ -61,8 +61,8 @@ def make_environments(
     """``num_envs`` environments from a Gymnasium id, an instance, a factory, or a vector environment.
 
     ``num_envs`` None: 1, or what the vector environment has. A given instance or vector environment is
-    stepped but never closed. ``policy``: what a fault leads to. ValueError: an unknown id, a backend the task
-    does not have, an instance that cannot be replicated, spaces that are not supported.
+    stepped but never closed. ``policy``: what happens after a fault. ValueError: an unknown id, a backend
+    that the task does not have, an instance that cannot be replicated, spaces that are not supported.
     """
     if backend not in BACKENDS:
         raise ValueError(f"vector backend is {backend!r}; expected one of: {', '.join(BACKENDS)}.")

@@ -27,7 +27,7 @@ EXTRAS = {
     "gymnasium.envs.mujoco": ("mujoco", "mujoco"),
     "ale_py": ("ale_py", "atari"),
 }
-# What third parties say while a standard task is built, and what no user can act on.
+# Warnings of third parties while a standard task is built; a user can do nothing about them.
 NOISE = (
     r".*precision lowered by casting.*",
     r".*pkg_resources is deprecated.*",
@@ -76,8 +76,8 @@ def register_atari(env_id: str) -> None:
 
 
 @contextlib.contextmanager
-def quiet(spec: EnvSpec | None = None) -> Iterator[None]:
-    """Keep the known noise of third parties off stderr while a task is built; every other warning passes."""
+def without_noise(spec: EnvSpec | None = None) -> Iterator[None]:
+    """Hide the known warnings of third parties while a task is built; every other warning passes."""
     with warnings.catch_warnings(), contextlib.ExitStack() as stack:
         for message in NOISE:
             warnings.filterwarnings("ignore", message=message)
@@ -144,7 +144,7 @@ class _AnyAction(gym.spaces.MultiDiscrete):
 
 
 def _trusting(env: Any) -> Any:
-    """Spare a vector version of our own making the check of every action: a fifth of a CartPole step."""
+    """Skip the check of every action in a vector version that we made: a fifth of a CartPole step."""
     space = env.action_space
     if type(space) is gym.spaces.MultiDiscrete:
         env.action_space = _AnyAction(space.nvec, dtype=space.dtype, start=space.start)
@@ -166,7 +166,7 @@ def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int) -> Any
         raise ValueError(
             f"EnvPool has no task {name!r}.{_did_you_mean(name, known)} Or use another vector backend."
         )
-    with quiet():
+    with without_noise():
         return envpool.make(name, env_type="gymnasium", num_envs=num_envs, seed=seed, num_threads=num_threads)
 
 
@@ -174,7 +174,7 @@ def _explained(env_id: str, make: Callable[[], Any]) -> Any:
     """What ``make`` returns; errors about the id or a missing package become a ValueError with advice."""
     spec = find_spec(env_id)
     try:
-        with quiet(spec):
+        with without_noise(spec):
             return make()
     except ModuleNotFoundError as error:
         module = env_id.partition(":")[0]
@@ -293,7 +293,7 @@ def _from_spec(env: gym.Env) -> gym.Env:
     spec = env.spec
     if spec is None:
         raise ValueError("it has no spec")
-    with quiet(spec):
+    with without_noise(spec):
         twin = gym.make(spec, disable_env_checker=True)
     if _layers(twin) != _layers(env):
         twin.close()

@@ -111,23 +111,13 @@ class Distribution:
     def _gaussian(self, component: Component) -> tuple[Tensor, Tensor]:
         mean = self.parameters[:, component.parameter : component.parameter + component.count]
         assert self.log_std is not None
-        start = _gaussian_offset(self.layout, component)
+        start = component.deviation
         return mean, self.log_std[..., start : start + component.count].clamp(*LOG_STD_RANGE)
 
     def _half_range(self, component: Component) -> Tensor:
         assert self.half_range is not None
-        start = _gaussian_offset(self.layout, component)
+        start = component.deviation
         return self.half_range[start : start + component.count]
-
-
-def gaussian_dimensions(layout: ActionLayout) -> int:
-    """How many Gaussian columns the layout has in all."""
-    return sum(c.count for c in layout.components if c.kind == "gaussian")
-
-
-def _gaussian_offset(layout: ActionLayout, component: Component) -> int:
-    earlier = (c for c in layout.components if c.kind == "gaussian" and c.column < component.column)
-    return sum(c.count for c in earlier)
 
 
 def _inverse_cdf(logits: Tensor, u: Tensor) -> Tensor:

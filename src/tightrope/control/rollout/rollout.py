@@ -10,9 +10,7 @@ from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
 from tightrope.control.engine.base import Engine, Steps
 from tightrope.control.environments.base import Environments
 from tightrope.control.policy.normalise import Normalisers
-from tightrope.control.spaces import Inputs
-
-Array = np.ndarray
+from tightrope.control.spaces import Array, Inputs
 
 
 class Rollout:
@@ -22,7 +20,7 @@ class Rollout:
     which an environment failed and was restarted; its input is the last observation of the episode that was
     cut, from whose value the step before it is bootstrapped.
 
-    ``inputs``: what the policy saw (normalised). ``raw``: flat observations, and ``rewards``, as they came.
+    ``inputs``: what the policy saw (normalised). ``raw``: flat observations, and ``rewards``, unchanged.
     ``last``: encoded observation after the last step. ``finals``: (column, rows, encoded true final
     observations) of truncated episodes whose next row already belongs to a new episode.
     """
