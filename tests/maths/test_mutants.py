@@ -91,12 +91,6 @@ MUTANTS = (
         "future = tail[:, -1]",
         "future = 0 * tail[:, -1]",
     ),
-    Mutant(
-        "the next value is that of the next episode",
-        "returns.py",
-        "torch.where(ended, final_values, shifted)",
-        "shifted",
-    ),
     Mutant("the sign of the policy loss", "surrogate.py", "return -surrogate", "return surrogate"),
     Mutant(
         "the min is lost",
