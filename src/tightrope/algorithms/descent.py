@@ -142,7 +142,8 @@ class Descent:
         return self.checked.halted(self._explain, poll=True)
 
     def metrics(self) -> dict[str, float]:
-        """Means over every minibatch."""
+        """Means over every minibatch. NonFiniteError when the last gradient was bad."""
+        self.halted()
         return {
             **self.meter.means(),
             **self.micro_batches.metrics(),

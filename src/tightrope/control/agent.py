@@ -20,7 +20,7 @@ from tightrope.algorithms.optimise import (
     restore_optimiser,
     set_learning_rates,
 )
-from tightrope.algorithms.settings import PPOSettings
+from tightrope.algorithms.settings import PPOSettings, UpdateSettings
 from tightrope.control.engine.base import limited_threads
 from tightrope.control.engine.choose import choose_engine, usable_device
 from tightrope.control.environments.base import Environments
@@ -388,7 +388,7 @@ def _is_batched(layout: ObservationLayout, observation: Any) -> bool:
     return np.ndim(observation) > len(leaf.space.shape or ())
 
 
-def _settings_metrics(present: Any) -> dict[str, float]:
+def _settings_metrics(present: UpdateSettings) -> dict[str, float]:
     names = ("learning_rate", "critic_learning_rate", "clip", "entropy_weight", "kl_beta")
     found = {f"train/{name}": getattr(present, name, None) for name in names}
     return {name: value for name, value in found.items() if value is not None}

@@ -11,7 +11,7 @@ from tightrope.control.environments import tasks
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
-from tightrope.control.settings import EVALUATION_SEED
+from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 
 MAX_COPIES = 10
 
@@ -66,7 +66,7 @@ def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:
     }
 
 
-def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environments:
+def evaluation_environments(env: Any, settings: TrainSettings, episodes: int) -> Environments:
     """Copies for evaluation, in this process: at most MAX_COPIES, apart from those that train.
 
     Raises ValueError when the environment cannot be made a second time (a vector environment, say).
@@ -75,7 +75,7 @@ def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environme
         raise ValueError(
             "A vector environment cannot be copied for evaluation; pass a Gymnasium id or a factory."
         )
-    source = settings.env if env is None else env
+    source: Any = settings.env if env is None else env
     backend = settings.vector_backend if settings.vector_backend in ("vector", "envpool") else "serial"
     if hasattr(source, "observation_space"):  # an instance trains already: evaluation needs copies, not it
         source = tasks.replicas(source, 2)[1]

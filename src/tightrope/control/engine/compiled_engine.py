@@ -6,7 +6,6 @@ import copy
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -241,21 +240,15 @@ class CompiledEngine:
         """
         steps = batch.as_steps().select(slice(0, settings.minibatch_size))
         once = dataclasses.replace(settings, num_epochs=1)
-        results = []
-        for compute in (self._with_torch, self._with_engine):
-            policy, optimiser = copy.deepcopy((self.policy, self.optimiser))
+        pairs = [copy.deepcopy((self.policy, self.optimiser)) for _ in range(2)]
+        for _, optimiser in pairs:
             for group in optimiser.param_groups:
                 group.update(SMOOTH)
-            compute(policy, optimiser, steps, once)
-            results.append([p.detach() for p in policy.parameters()])
-        return max(float((a - b).abs().max()) for a, b in zip(*results, strict=True))
-
-    @staticmethod
-    def _with_torch(policy: Any, optimiser: Any, batch: Batch, settings: PPOSettings) -> None:
-        ppo.update(policy, optimiser, batch, settings, np.random.default_rng(0))
-
-    def _with_engine(self, policy: Any, optimiser: Any, batch: Batch, settings: PPOSettings) -> None:
-        CompiledEngine(policy, optimiser, 1).update(batch, settings, np.random.default_rng(0))
+        (expected, first), (found, second) = pairs
+        ppo.update(expected, first, steps, once, np.random.default_rng(0))
+        CompiledEngine(found, second, 1).update(steps, once, np.random.default_rng(0))
+        parameters = zip(expected.parameters(), found.parameters(), strict=True)
+        return max(float((a.detach() - b.detach()).abs().max()) for a, b in parameters)
 
 
 class _Run:

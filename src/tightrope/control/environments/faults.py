@@ -8,9 +8,11 @@ environments.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,6 +23,7 @@ LONGEST_PAUSE = 2.0
 Outcome = TypeVar("Outcome")
 
 
+@dataclass(eq=False, repr=False)
 class EnvironmentFault(RuntimeError):
     """An environment raised, hung or broke Gymnasium's API, or its process died.
 
@@ -29,31 +32,21 @@ class EnvironmentFault(RuntimeError):
     gone or does not answer.
     """
 
-    def __init__(
-        self,
-        message: str,
-        index: int = -1,
-        step: int = -1,
-        *,
-        env_id: str = "",
-        worker: int = 0,
-        seed: int | None = None,
-        action: str | None = None,
-        lost: bool = False,
-    ) -> None:
-        super().__init__(message)
-        self.index = index
-        self.step = step
-        self.env_id = env_id
-        self.worker = worker
-        self.seed = seed
-        self.action = action
-        self.lost = lost
+    message: str
+    index: int = -1
+    step: int = -1
+    env_id: str = ""
+    worker: int = 0
+    seed: int | None = None
+    action: str | None = None
+    lost: bool = False
+
+    def __post_init__(self) -> None:
+        super().__init__(self.message)
 
     def record(self) -> dict[str, Any]:
-        """The arguments, as JSON, from which another process can build this fault again."""
-        names = ("index", "step", "env_id", "worker", "seed", "action")
-        return {"message": str(self), **{name: getattr(self, name) for name in names}}
+        """The arguments but ``lost``, as JSON, from which another process can build this fault again."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if name != "lost"}
 
 
 class ApiBreak(Exception):
@@ -127,7 +120,7 @@ class Restarts:
             f"{fault}\nEnvironments were restarted {self.count} times; max_env_restarts allows no more. Fix "
             "the environment, or allow more."
         )
-        return EnvironmentFault(**{**fault.record(), "message": message})
+        return dataclasses.replace(fault, message=message, lost=False)
 
 
 def restart_seed(seed: int, restarts: int, index: int) -> int:

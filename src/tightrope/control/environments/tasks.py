@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import difflib
+import functools
 import importlib
 import importlib.util
 import warnings
@@ -120,18 +121,16 @@ def make_vector_by_id(env_id: str, num_envs: int) -> Any:
         )
 
     def make() -> Any:
-        return _trusting(made())
-
-    def made() -> Any:
+        make_vec = functools.partial(gym.make_vec, env_id, num_envs, vectorization_mode="vector_entry_point")
         same_step: dict[str, Any] = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
         if env_id.startswith("ALE/"):
-            same_step["reward_clipping"] = False  # returns are reported in the game's own points
+            same_step["reward_clipping"] = False  # returns are reported in the points of the game
         try:
-            return gym.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **same_step)
+            return _trusting(make_vec(**same_step))
         except TypeError as error:
             if "autoreset_mode" not in str(error):
                 raise
-        return gym.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point")
+        return _trusting(make_vec())
 
     return _explained(env_id, make)
 
