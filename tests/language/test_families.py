@@ -6,7 +6,7 @@ import pytest
 import torch
 from language.tiny import VOCABULARY, padded, saved
 
-from tightrope.algorithms.optimise import SamplingMismatch
+from tightrope.algorithms.descent import SamplingMismatch
 from tightrope.language import selfcheck
 from tightrope.language.alignment.figures import refuse_mismatch
 from tightrope.language.data.batching import Example, collate, row_of

@@ -10,7 +10,7 @@ import pytest
 import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
-from tightrope.algorithms.optimise import StepGuard
+from tightrope.algorithms.descent import CheckedSteps
 from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Pair, preference_pairs
 from tightrope.language.model import lora
@@ -130,7 +130,7 @@ def test_micro_batches_add_up_to_the_minibatch():
         parameters = [*model.base.parameters(), *model.head.parameters()]
         settings = settings_of(micro_batch_size=micro, max_grad_norm=None)
         optimiser = torch.optim.SGD(parameters, lr=0.1)
-        metrics = take_step(objective, pairs, optimiser, StepGuard(torch.device("cpu")), settings)
+        metrics = take_step(objective, pairs, optimiser, CheckedSteps(torch.device("cpu")), settings)
         found.append((metrics, [p.detach() for p in parameters]))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-4)
     for a, b in zip(found[0][1], found[1][1], strict=True):

@@ -12,7 +12,8 @@ import torch
 from language.test_data import chatml, random_examples
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
-from tightrope.algorithms.optimise import NonFiniteError, StepGuard
+from tightrope.algorithms.descent import CheckedSteps
+from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.language.data.batching import collate, pack, row_of
 from tightrope.language.data.examples import hold_out
 from tightrope.language.model import lora
@@ -108,7 +109,7 @@ def test_micro_batches_add_up_to_the_minibatch(size):
         optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
         settings = settings_of(micro_batch_size=micro, max_grad_norm=None)
         metrics = take_step(
-            objective_of(model, rows), rows, optimiser, StepGuard(torch.device("cpu")), settings
+            objective_of(model, rows), rows, optimiser, CheckedSteps(torch.device("cpu")), settings
         )
         found.append((metrics, [p.detach() for p in model.parameters()]))
     (whole, wanted), (split, weights) = found
@@ -128,7 +129,7 @@ def test_a_gradient_that_is_not_finite_stops_before_the_step():
     objective = dataclasses.replace(objective_of(model, rows), loss=loss)
     optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
     with pytest.raises(NonFiniteError, match="The loss is nan in this step"):
-        take_step(objective, rows, optimiser, StepGuard(torch.device("cpu")), settings_of())
+        take_step(objective, rows, optimiser, CheckedSteps(torch.device("cpu")), settings_of())
     assert all(torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
 
 

@@ -76,7 +76,7 @@ def evaluate(words: list[str]) -> int:
     """``tightrope evaluate RUN``: how good the saved policy is."""
     given = evaluate_parser().read(words)
     _import_named(given.get("env_module"))
-    from tightrope.control.evaluate import evaluate_run
+    from tightrope.control.saving import evaluate_run
 
     names = ("episodes", "stochastic", "best", "seed", "env", "device")
     result = evaluate_run(given["run"], **{name: given[name] for name in names if name in given})

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tightrope.algorithms.descent import SamplingMismatch
 from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
-from tightrope.algorithms.optimise import SamplingMismatch
 from tightrope.language.generation.sample import log_ratio_limit
 from tightrope.language.policy.rollout import Experience
 from tightrope.language.reward.functions import Scores

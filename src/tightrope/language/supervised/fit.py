@@ -17,9 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tightrope.algorithms.memory import Parts
+from tightrope.algorithms.descent import CheckedSteps
+from tightrope.algorithms.memory import MicroBatches
 from tightrope.algorithms.nonfinite import explain_loss
-from tightrope.algorithms.optimise import Adam, Meter, StepGuard
+from tightrope.algorithms.optimise import Adam
 from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.checkpoint import understood
@@ -110,14 +111,14 @@ class SupervisedLearner:
         Raises NonFiniteError before a step with a NaN or an infinity in its gradient.
         """
         objective, total = self.objective, self.total
-        guard = StepGuard(self.parameters[0].device)
+        checked = CheckedSteps(self.parameters[0].device)
         batches = minibatches(objective.items, self.settings, self.rollbacks)
         for minibatch in islice(batches, self.step, None):
             now = dataclasses.replace(self.settings, **self.changes)
             rate = scheduled(now.learning_rate, now.learning_rate_schedule, self.step / total)
             self.optimiser.param_groups[0]["lr"] = rate
-            memory = Parts(self.micro_batch_size)
-            metrics = take_step(objective, minibatch, self.optimiser, guard, now, memory)
+            memory = MicroBatches(self.micro_batch_size)
+            metrics = take_step(objective, minibatch, self.optimiser, checked, now, memory)
             metrics |= {f"{objective.steps}/learning_rate": rate or 0.0, **memory.metrics()}
             self.step += 1
             self.micro_batch_size = memory.size
@@ -215,15 +216,14 @@ def take_step(
     objective: Objective,
     minibatch: Sequence[Any],
     optimiser: torch.optim.Optimizer,
-    guard: StepGuard,
+    checked: CheckedSteps,
     settings: SupervisedSettings,
-    parts: Parts | None = None,
+    parts: MicroBatches | None = None,
 ) -> dict[str, float]:
     """One optimiser step on the mean over all terms of the minibatch, however it is split; ``parts`` knows
     from the steps before what fits into memory.
     """
-    parts = parts or Parts(settings.micro_batch_size)
-    meter = Meter()
+    parts = parts or MicroBatches(settings.micro_batch_size)
     count = sum(objective.count(item) for item in minibatch)
 
     def gradient(size: int | None) -> dict[str, Tensor]:
@@ -236,12 +236,11 @@ def take_step(
                 sums[name] = sums[name] + x if name in sums else x
         return sums
 
-    sums = parts.fitting(len(minibatch), gradient, optimiser)
-    guard.refuse(~torch.isfinite(sums["loss"]))
-    guard.step(optimiser, settings.max_grad_norm, meter)
-    guard.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
+    sums = parts.compute(len(minibatch), gradient, optimiser)
+    norm = checked.take(optimiser, settings.max_grad_norm, sums["loss"])
+    checked.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
     metrics = {f"{objective.name}/{name}": float(x) / count for name, x in sums.items()}
-    metrics[f"{objective.steps}/grad_norm"] = meter.means()["train/grad_norm"]
+    metrics[f"{objective.steps}/grad_norm"] = float(norm)
     return metrics
 
 
