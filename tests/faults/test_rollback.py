@@ -80,7 +80,7 @@ def test_language_goes_back_goes_on_and_counts(monkeypatch, tmp_path):
         batch = whole(experience, *arguments)
         calls[0] += 1
         if calls[0] in (3, 4):
-            texts.append(experience.ids())
+            texts.append(experience.ids)
         if calls[0] == 3:
             batch.advantages[0, 0] = torch.nan
         return batch

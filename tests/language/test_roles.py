@@ -37,7 +37,7 @@ def experienced(present):
     roles = make_roles(present, notify=lambda text: None)
     experience = gather(roles, PROMPTS, 1, 0, 2)
     scores = Scores(np.linspace(-1, 2, 6), np.ones(6, bool), {}, {}, {})
-    rewards, _ = rewards_of(experience, scores, present, present.kl_beta)
+    rewards = rewards_of(experience, scores, present, present.kl_beta).rewards
     return roles, experience, rewards, to_batch(experience, rewards, torch.ones(6, dtype=torch.bool), present)
 
 
@@ -93,7 +93,7 @@ def test_the_pass_of_the_rollout_is_the_first_of_the_update(folder, tune, critic
     part = part.select(torch.tensor([4, 0, 3]))
     found, weights = [], torch.linspace(-1, 1, part.mask.numel()).view(part.mask.shape)
     for first_pass in (experience.first_pass, None):
-        model = PolicyModel(roles, exact=roles.settings.exact_in_loss, first_pass=first_pass)
+        model = PolicyModel(roles, first_pass=first_pass)
         now = model(part)
         total = (now.logp * weights).sum() + now.values.square().sum()
         total = total + now.kl.sum() if roles.settings.exact_in_loss else total
@@ -267,7 +267,7 @@ def test_critic_none_subtracts_what_the_other_responses_got(folder):
     present = settings(folder, critic="none", kl_beta=0.0)
     _, experience, _, _ = experienced(settings(folder))
     scores = Scores(np.array([1.0, 3.0, 0.0, 5.0, 2.0, 2.0]), np.ones(6, bool), {}, {}, {})
-    rewards, _ = rewards_of(experience, scores, present, 0.0)
+    rewards = rewards_of(experience, scores, present, 0.0).rewards
     batch = to_batch(experience, rewards, torch.ones(6, dtype=torch.bool), present)
     assert [float(row[0]) for row in batch.advantages] == [-2.0, 2.0, -5.0, 5.0, 0.0, 0.0]
     assert (batch.returns == 0).all()
@@ -278,7 +278,7 @@ def test_a_sample_that_does_not_count_is_left_out(folder):
     _, experience, _, _ = experienced(present)
     valid = torch.tensor([True, False, True, True, False, True])
     scores = Scores(np.where(valid, 1.0, np.nan), valid.numpy(), {}, {}, {})
-    batch = to_batch(experience, rewards_of(experience, scores, present, 0.05)[0], valid, present)
+    batch = to_batch(experience, rewards_of(experience, scores, present, 0.05).rewards, valid, present)
     assert len(batch) == 4 and batch.advantages.isfinite().all()
 
 

@@ -37,7 +37,7 @@ def rollout():
     ref_logp = torch.tensor([[-1.5, -2.25, nan], [-2.0, -2.0, -2.0], [-0.25, nan, nan]])
     responses = SimpleNamespace(tokens=tokens, mask=mask, ended=torch.tensor([True, False, True]))
     ids = [row[kept].tolist() for row, kept in zip(tokens, mask, strict=True)]
-    experience = SimpleNamespace(responses=responses, logp=logp, ref_logp=ref_logp, ids=lambda: ids)
+    experience = SimpleNamespace(responses=responses, logp=logp, ref_logp=ref_logp, ids=ids)
     valid = torch.tensor([True, False, True])
     advantages = torch.tensor([[1.0, 3.0, nan], [-2.0, nan, nan]])
     kept = mask[valid]

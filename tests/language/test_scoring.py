@@ -101,7 +101,7 @@ def test_functions_and_models_judge_the_very_tokens_that_were_sampled(sampled):
         return torch.zeros(6)
 
     Judge(roles, Rewards([spy]), SimpleNamespace(score=score))(ASKED, experience)
-    assert seen["ids"] == experience.ids()
+    assert seen["ids"] == experience.ids
     assert [roles.tokenizer(text)["input_ids"] for text in seen["texts"]] != seen["ids"]
     whole = [[*prompt.tokens, *ids] for prompt, ids in zip(ASKED, seen["ids"], strict=True)]
     assert seen["model"] == whole

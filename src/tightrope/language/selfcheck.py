@@ -39,7 +39,7 @@ def check_model(model: str, dtype: str = "float32") -> list[Finding]:
     prompts = [Prompt(tuple(roles.tokenizer(text)["input_ids"][:16]), text, {}) for text in WORDS]
     experience = gather(roles, prompts, 0, 0, 2)
     scores = Scores(np.linspace(-1, 1, 8), np.ones(8, bool), {}, {}, {})
-    rewards, _ = rewards_of(experience, scores, settings, settings.kl_beta)
+    rewards = rewards_of(experience, scores, settings, settings.kl_beta).rewards
     batch = to_batch(experience, rewards, torch.ones(8, dtype=torch.bool), settings)
     return [
         _same_logits(roles, experience),

@@ -20,7 +20,6 @@ from tightrope.language.alignment.experience import (
     PromptOrder,
     comparable,
     gather,
-    kl_share,
     respond,
     rewards_of,
     to_batch,
@@ -47,7 +46,7 @@ from tightrope.language.reward.judge import (
     reward_adapter,
     shares_trunk,
 )
-from tightrope.language.settings import AlignSettings
+from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.maths.values import explained_variance
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.history import Checkpoint
@@ -94,7 +93,8 @@ class Trainer:
             Pretraining.make(settings, self.roles, listeners.warn) if settings.ptx_weight else None
         )
         self.monitor = Monitor(kl_budget=settings.kl_budget)
-        self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
+        self.log_ratio_limit = log_ratio_limit(settings.dtype)
+        self.episodes, self.iteration, self.stopped = 0, 0, False
         self.seconds, self.rollbacks, self.newest = 0.0, 0, dict[str, float]()
         self.changes: dict[str, Any] = {}
         self.micro_batch_size = settings.update.micro_batch_size  # halved when memory runs out
@@ -191,7 +191,8 @@ class Trainer:
         for alarm in self.monitor.add(*seen):
             self.listeners.warn(alarm.text)
             self.stopped = self.stopped or alarm.stop
-        metrics |= self.monitor.metrics()
+        if self.monitor.fit.decided:
+            metrics["objective/gold_predicted_peak_kl"] = self.monitor.fit.peak_kl
 
     # ------------------------------------------------------------------------------------------ the state
 
@@ -286,7 +287,7 @@ class Trainer:
         experience = gather(self.roles, prompts, *given, keep=keep)
         if experience.short_of_memory:
             self._smaller(len(experience.tokens))
-        refuse_bad_numbers(experience, self.roles.named_parameters())
+        refuse_bad_numbers(experience, self.roles)
         gathered = time.perf_counter()
         asked = [prompt for prompt in prompts for _ in range(settings.samples_per_prompt)]
         scores = self.judge(asked, experience, self._trainer_state())
@@ -294,17 +295,19 @@ class Trainer:
         self._tell_faults(scores)
         if settings.critic == "none":
             scores.valid[:] = comparable(scores.valid, settings.samples_per_prompt)
-        rewards, self.reward_scale = rewards_of(experience, scores, settings, self.kl_beta)
+        found = rewards_of(experience, scores, settings, self.kl_beta)
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
-        batch = to_batch(experience, rewards, valid, settings)
-        share = kl_share(experience, settings, self.kl_beta)
-        plain = rewards / self.reward_scale  # the metrics are those before whiten_rewards
-        metrics = describe(experience, scores, plain, share, valid) | scores.metrics | gold
-        refuse_mismatch(metrics["objective/sampling_gap"], settings.dtype, first=not self.iteration)
+        batch = to_batch(experience, found.rewards, valid, settings)
+        plain = found.rewards / found.scale  # the metrics are those before whiten_rewards
+        metrics = describe(experience, scores, plain, found.kl_share, valid) | scores.metrics | gold
+        gap = metrics["objective/sampling_gap"]
+        refuse_mismatch(gap, self.log_ratio_limit, settings.dtype, first=not self.iteration)
         self._watch(metrics)
         judged = time.perf_counter()
-        if len(batch) and not self.stopped:
-            metrics |= self._update(batch, present, experience)
+        counts = bool(scores.valid.any())
+        if counts and not self.stopped:
+            # a KL in the loss is scaled as the rewards were
+            metrics |= self._update(batch, present, experience, self.kl_beta * found.scale)
             if settings.critic != "none":
                 metrics["train/explained_variance"] = float(
                     explained_variance(batch.old_values, batch.returns, batch.mask)
@@ -313,7 +316,7 @@ class Trainer:
         metrics["train/learning_rate"] = present.learning_rate
         metrics["time/score_seconds"] = scored - gathered
         metrics["time/update_seconds"] = time.perf_counter() - judged
-        if settings.kl_goal is not None and len(batch):
+        if settings.kl_goal is not None and counts:
             controller = AdaptiveKL(self.kl_beta, settings.kl_goal, settings.kl_horizon)
             self.kl_beta = controller.next(metrics["objective/kl"], len(asked)).kl_beta
         self.episodes += len(asked)
@@ -324,28 +327,32 @@ class Trainer:
         on_grid = self._reached(settings.checkpoint_every)
         return Update(self.episodes, self.total, metrics, before, on_grid=on_grid, samples=rows, pause=pause)
 
-    def _update(self, batch: Batch, present: Any, experience: Experience) -> dict[str, float]:
-        """PPO, or the critic alone while it warms up."""
+    def _update(
+        self, batch: Batch, present: RLHFSettings, experience: Experience, kl_weight: float
+    ) -> dict[str, float]:
+        """PPO, or the critic alone while it warms up. ``kl_weight``: of a KL in the loss."""
         warming = self.iteration < self.settings.critic_warmup
-        exact = self.settings.exact_in_loss
-        model = PolicyModel(
-            self.roles, exact=exact, critic_only=warming, first_pass=experience.take_first_pass()
-        )
+        model = PolicyModel(self.roles, critic_only=warming, first_pass=experience.first_pass)
+        experience.first_pass = None  # where memory runs out, nothing else may hold on to its graph
         if warming:
             batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
             present = present.unchecked(entropy_weight=0.0, target_kl=None)
-        limit = log_ratio_limit(self.settings.dtype)
-        kl_weight = self.kl_beta * self.reward_scale  # a KL in the loss is scaled as the rewards were
         if present.normalise_advantages and not self.settings.kl.endswith("reward"):
             # one scale for the whole rollout, so that a KL in the loss keeps its price in units of the reward
             advantages, scale = shared_scale(batch.advantages, batch.mask)
             batch = dataclasses.replace(batch, advantages=advantages)
             kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
         extra = None if warming else self._extra_loss(kl_weight)
-        present = present.unchecked(micro_batch_size=self.micro_batch_size)
-        given = (model, self.optimiser, batch, present, self.update_rng)
-        draw = None if extra is None or self.pretraining is None else self.pretraining.draw
-        metrics = ppo.update(*given, extra_loss=extra, draw=draw, log_ratio_limit=limit)
+        metrics = ppo.update(
+            model,
+            self.optimiser,
+            batch,
+            present.unchecked(micro_batch_size=self.micro_batch_size),
+            self.update_rng,
+            extra_loss=extra,
+            draw=None if extra is None or self.pretraining is None else self.pretraining.draw,
+            log_ratio_limit=self.log_ratio_limit,
+        )
         if "train/micro_batch_size" in metrics:
             self._smaller(int(metrics["train/micro_batch_size"]))
         return metrics

@@ -183,10 +183,6 @@ class Monitor:
             self._given += [alarm.kind for alarm in alarms if not alarm.stop]
         return alarms
 
-    def metrics(self) -> dict[str, float]:
-        """``objective/gold_predicted_peak_kl``, where the points decide it."""
-        return {"objective/gold_predicted_peak_kl": self.fit.peak_kl} if self.fit.decided else {}
-
     @property
     def newest_gold(self) -> float | None:
         """The gold score of the newest evaluation that gave one."""

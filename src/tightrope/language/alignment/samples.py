@@ -41,7 +41,7 @@ def sample_rows(
     """
     responses = experience.responses
     log_ratio = experience.ref_logp - experience.logp
-    texts = [tokenizer.decode(ids, skip_special_tokens=True) for ids in experience.ids()]
+    texts = [tokenizer.decode(ids, skip_special_tokens=True) for ids in experience.ids]
     places = {row: place for place, row in enumerate(valid.nonzero()[:, 0].tolist())}
     rows = []
     for index, (prompt, text) in enumerate(zip(prompts, texts, strict=True)):

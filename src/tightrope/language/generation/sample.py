@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
-from tightrope.language.generation.distribution import Sampling, at_head, shape_logits
+from tightrope.language.generation.distribution import Sampling, next_logits
 from tightrope.language.model.parts import parts
 
 # A forward pass takes its cache under the old name up to transformers 5.23. From 5.24 on the name is new, and
@@ -45,9 +45,10 @@ class Responses:
     support: Tensor | None
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Completions:
-    """Responses to prompts. ``tokens``, ``real``: prompt and response, [B, P + R]; ``seconds``: to sample.
+    """Responses to prompts. ``tokens``, ``real``: prompt and response, [B, P + R]; ``ids``: of each response,
+    padding left out; ``seconds``: to sample.
 
     ``lower``: what enters the trunk's upper part, [B, P + R, d], where that was computed.
     """
@@ -55,13 +56,9 @@ class Completions:
     tokens: Tensor
     real: Tensor
     responses: Responses
+    ids: list[list[int]]
     seconds: float
-    lower: Tensor | None
-
-    def ids(self) -> list[list[int]]:
-        """The token ids of each response, padding left out."""
-        pairs = zip(self.responses.tokens, self.responses.mask, strict=True)
-        return [tokens[mask].tolist() for tokens, mask in pairs]
+    lower: Tensor | None = None
 
 
 @torch.no_grad()
@@ -122,8 +119,7 @@ def draw(
     hidden: Tensor, head: nn.Linear, sampling: Sampling, uniforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """One token a row from hidden states [N, d]: ids, log-probabilities [N], and with top-k its support."""
-    logits = shape_logits(nn.functional.linear(hidden, head.weight, head.bias), at_head(sampling, head))
-    support = None
+    logits, support = next_logits(hidden, head, sampling), None
     if sampling.top_k:
         logits, support = logits.topk(min(sampling.top_k, logits.shape[1]), dim=1)
     logs = logits.log_softmax(1)

@@ -9,6 +9,7 @@ reward     adapter "reward" and a head | a separate model | a function of the te
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from tightrope.language.generation.distribution import Sampling
+from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.memory import available_memory, check, job_of, ledger, reward_model_bytes
 from tightrope.language.model import lora
 from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, require_device
@@ -43,6 +44,16 @@ class Roles:
     settings: AlignSettings
     sampling: Sampling
     eos: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Fix what `token_statistics` is the same for in a rollout and its update."""
+        self.statistics = functools.partial(
+            token_statistics,
+            head=self.trunk.parts.head,
+            sampling=self.sampling,
+            reference_head=self.reference.trunk.parts.head,
+            ahead=self.settings.logp_alone,
+        )
 
     @property
     def trunk(self) -> Trunk:

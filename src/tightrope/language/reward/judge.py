@@ -68,15 +68,14 @@ class Judge:
     def _of_functions(self, prompts: Sequence[Prompt], answers: Completions, state: Any) -> Scores | None:
         if self.functions is None:
             return None
-        ids = answers.ids()
-        texts = [self.roles.tokenizer.decode(row, skip_special_tokens=True) for row in ids]
+        texts = [self.roles.tokenizer.decode(row, skip_special_tokens=True) for row in answers.ids]
         completions = [
             text if isinstance(prompt.shown, str) else [{"role": "assistant", "content": text}]
             for prompt, text in zip(prompts, texts, strict=True)
         ]
         names = {name for prompt in prompts for name in prompt.columns}
         columns = {name: [prompt.columns.get(name) for prompt in prompts] for name in sorted(names)}
-        return self.functions.score([p.shown for p in prompts], completions, ids, columns, state)
+        return self.functions.score([p.shown for p in prompts], completions, answers.ids, columns, state)
 
     @torch.no_grad()
     def _of_model(self, answers: Completions) -> np.ndarray | None:
