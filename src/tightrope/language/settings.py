@@ -129,13 +129,10 @@ class AlignSettings(ModelSettings):
     kl_beta: float = setting(0.05, "Weight of the KL to the reference; 0.02 to 0.2 is usual.", at_least=0)
     kl: str = setting(
         "k1-reward",
-        "Where the KL acts: in the reward (k1), exact and split, or in the loss alone.",
-        choices=(
-            "k1-reward", "exact-split", "k2-loss", "exact-loss",
-            "k2-reward", "k3-reward", "exact-reward", "k1-loss", "k3-loss",
-        ),
-    )  # fmt: skip
-    allow_biased_kl: bool = setting(False, "Accept a form of KL whose gradient is known to be wrong.")
+        "Where the KL acts: in the reward (k1), exact and split, or only in the loss.",
+        choices=("k1-reward", "exact-split", "k2-loss", "exact-loss"),
+    )
+    allow_biased_kl: bool = fixed(False)  # in settings.json of older runs
     kl_goal: float | None = setting(
         None, "Adapt kl_beta towards this KL per response, in nats (Ziegler: 6); none: fixed.", above=0
     )
@@ -219,12 +216,6 @@ class AlignSettings(ModelSettings):
         if self.critic == "adapter" and self.tune == "full":
             raise ValueError(
                 "critic adapter needs the frozen trunk of --tune lora. With --tune full use head or separate."
-            )
-        biased = self.kl not in ("k1-reward", "exact-split", "k2-loss", "exact-loss")
-        if biased and not self.allow_biased_kl:
-            raise ValueError(
-                f"kl {self.kl!r} has a gradient that is not the KL's. Use k1-reward or exact-split, or give "
-                "--allow-biased-kl to see what it does."
             )
         if self.ptx_weight and self.ptx_data is None:
             raise ValueError("ptx_weight needs texts: give ptx_data, or ptx_weight 0.")

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.language.alignment.iteration import Trainer
-from tightrope.language.alignment.kl import bias_of
 from tightrope.language.quiet import quiet
 from tightrope.language.settings import AlignSettings
 from tightrope.language.supervised.prepare import threads
@@ -64,8 +63,6 @@ def align(
     told = Listeners(listeners)
     for risk in settings.risks():
         told.warn(risk)
-    if (bias := bias_of(settings.kl)) is not None:
-        told.warn(f"{bias}.")
     require_tensorboard(settings.tensorboard)
     with threads(settings.threads):
         trainer = _trainer(settings, prompts, reward, gold, told)
