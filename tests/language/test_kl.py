@@ -15,7 +15,7 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.language.alignment.kl import (
     KL_FORMS,
-    AdaptiveKL,
+    adapted,
     kl_loss,
     kl_rewards,
     kl_steps,
@@ -373,37 +373,22 @@ def test_mistakes_are_named() -> None:
     assert kl_rewards("k1-reward", 0.0, LOGP, impossible, None, MASK).tolist() == [[0, 0, 0]]
 
 
-def test_the_controller_follows_zieglers_equation() -> None:
-    control = AdaptiveKL(0.2, target=6.0, horizon=10_000)
-    assert control.next(6.0, 512) == control
-    assert control.next(6.6, 500).kl_beta == pytest.approx(0.2 * (1 + 0.1 * 500 / 10_000))
-    assert control.next(5.4, 500).kl_beta == pytest.approx(0.2 * (1 - 0.1 * 500 / 10_000))
+def test_kl_beta_follows_zieglers_equation() -> None:
+    goal = {"target": 6.0, "horizon": 10_000}
+    assert adapted(0.2, 6.0, 512, **goal) == 0.2
+    assert adapted(0.2, 6.6, 500, **goal) == pytest.approx(0.2 * (1 + 0.1 * 500 / 10_000))
+    assert adapted(0.2, 5.4, 500, **goal) == pytest.approx(0.2 * (1 - 0.1 * 500 / 10_000))
     for extreme, sign in ((600.0, 1), (0.0, -1), (-3.0, -1)):
-        assert control.next(extreme, 500).kl_beta == pytest.approx(0.2 * (1 + sign * 0.2 * 500 / 10_000))
-
-
-def test_the_controller_is_its_fields() -> None:
-    """Saved and loaded in the middle it goes on as if it had not been."""
-    first = AdaptiveKL(0.2, 6.0).next(9.0, 64)
-    again = AdaptiveKL(**dataclasses.asdict(first))
-    assert again.next(2.0, 64) == first.next(2.0, 64) and first.kl_beta != 0.2
-
-
-def test_fed_with_the_mean_over_tokens_the_controller_would_only_fall() -> None:
-    """Why the sum over the response matters: 24 tokens at the target are a quarter of a nat per token."""
-    control, wrong = AdaptiveKL(0.2, 6.0), AdaptiveKL(0.2, 6.0)
-    for _ in range(67):
-        control, wrong = control.next(6.0, 512), wrong.next(6.0 / 24, 512)
-    assert control.kl_beta == 0.2
-    assert wrong.kl_beta == pytest.approx(0.1, rel=0.01)
-
-
-def test_the_controllers_mistakes_are_named() -> None:
-    with pytest.raises(ValueError, match=r"kl_beta is 0.0; .* needs a number above 0"):
-        AdaptiveKL(0.0, 6.0)
-    with pytest.raises(ValueError, match="target is nan"):
-        AdaptiveKL(0.1, math.nan)
+        assert adapted(0.2, extreme, 500, **goal) == pytest.approx(0.2 * (1 + sign * 0.2 * 500 / 10_000))
     with pytest.raises(ValueError, match="the KL is nan"):
-        AdaptiveKL(0.1, 6.0).next(math.nan, 64)
-    with pytest.raises(ValueError, match="Use a horizon above 200"):
-        AdaptiveKL(0.1, 6.0, horizon=100).next(7.0, 1000)
+        adapted(0.1, math.nan, 64, **goal)
+
+
+def test_with_the_mean_over_tokens_kl_beta_would_only_fall() -> None:
+    """Why the sum over the response matters: 24 tokens at the target are a quarter of a nat per token."""
+    right = wrong = 0.2
+    for _ in range(67):
+        right = adapted(right, 6.0, 512, target=6.0, horizon=10_000)
+        wrong = adapted(wrong, 6.0 / 24, 512, target=6.0, horizon=10_000)
+    assert right == 0.2
+    assert wrong == pytest.approx(0.1, rel=0.01)

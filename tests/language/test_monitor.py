@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.stats import linregress
 
-from tightrope.language.alignment.monitor import FEWEST_POINTS, WINDOWS, Monitor, fit, rising
+from tightrope.language.alignment.monitor import FEWEST_POINTS, TREND_WINDOWS, Monitor, fit, rising
 
 ALPHA, BETA, OFFSET = 1.0, 0.4, -0.3
 PEAK_KL = math.exp(ALPHA / BETA - 1) ** 2  # 20.1 nats
@@ -114,7 +114,7 @@ def test_many_points_at_one_kl_are_few_points():
 
 def test_kls_that_hardly_differ_are_said_to_be_too_near():
     found = fit([(kl, curve(kl)) for kl in np.linspace(10, 20, 12)])
-    assert found.reason == "the KLs reach from 10 to 20, too near to each other"
+    assert found.reason == "the KLs reach from 10 to 20, too close to each other"
 
 
 def test_points_that_are_not_finite_are_left_out_and_a_negative_kl_counts_as_zero():
@@ -197,7 +197,7 @@ def test_proxy_up_and_gold_down_is_over_optimisation():
         for alarm in monitor.add(kl, 0.1 * index, value):
             places[alarm.kind] = index
             assert "kl_beta" in alarm.text and not alarm.stop
-    assert 10 + WINDOWS[0] // 2 <= places["over-optimised"] <= 10 + WINDOWS[0]
+    assert 10 + TREND_WINDOWS[0] // 2 <= places["over-optimised"] <= 10 + TREND_WINDOWS[0]
 
 
 @pytest.mark.parametrize("direction", [-1.0, 0.0])
@@ -243,7 +243,7 @@ def test_updates_without_gold_or_proxy_are_no_points():
         monitor.add(float(kl), 1.0)
         monitor.add(float(kl), 1.0, math.nan)
     assert monitor.fit.points == 0 and not monitor.fit.decided
-    for kl in range(WINDOWS[-1]):
+    for kl in range(TREND_WINDOWS[-1]):
         assert all(alarm.kind != "over-optimised" for alarm in monitor.add(float(kl), math.nan, -1.0 * kl))
 
 

@@ -137,9 +137,6 @@ def test_the_comparison_shows_both_responses():
     table = [{"prompt": "The film", "before": "was long", "after": "was great"}]
     text = printed(print_comparison, table, width=100)
     assert "was long" in text and "was great" in text and "score" not in text
-    with_scores = [{**table[0], "score_before": -0.5, "score_after": None}]
-    text = printed(print_comparison, with_scores, width=100)
-    assert "score before" in text and "-0.5" in text
 
 
 def test_long_texts_keep_the_end_of_a_prompt_and_the_beginning_of_a_response():

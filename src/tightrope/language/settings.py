@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.settings.fields import SCHEDULES, Schedule, fixed, of_update_rule, setting
@@ -236,7 +237,7 @@ class AlignSettings(ModelSettings):
         return self.update.minibatch_size >= self.batch_size and self.update.micro_batch_size is None
 
     def risks(self) -> list[str]:
-        """What is unusual about these settings and why it is risky; training starts all the same."""
+        """What is unusual about these settings and why it is risky; training starts anyway."""
         found = []
         if self.kl_beta == 0 and self.kl_budget is None:
             found.append(
@@ -249,6 +250,24 @@ class AlignSettings(ModelSettings):
                 "Usual with tune full: 1e-6 to 1e-5 (tiny models stand more)."
             )
         return found
+
+
+AnySettings = TypeVar("AnySettings", bound=ModelSettings)
+
+
+def recorded(settings: AnySettings, **given: Any) -> AnySettings:
+    """The settings that settings.json keeps of what was given in Python: paths are stored as text. Of an
+    object only its name is, in angle brackets, so that nobody takes it for a file, a folder or a reward.
+    None keeps the setting.
+    """
+    names: dict[str, Any] = {
+        name: str(value)
+        if isinstance(value, str | Path)
+        else f"<{getattr(value, '__name__', type(value).__name__).strip('<>')}>"
+        for name, value in given.items()
+        if value is not None
+    }
+    return settings.with_values(**names)
 
 
 class Recipe(NamedTuple):

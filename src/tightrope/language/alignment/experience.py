@@ -20,7 +20,7 @@ from tightrope.language.data.batching import length_groups, pad_left
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions, sample
 from tightrope.language.policy.roles import Roles
-from tightrope.language.policy.rollout import Experience, FirstPass, Inputs
+from tightrope.language.policy.rollout import Experience, FirstPass, ResponseInputs
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings
 from tightrope.maths import returns
@@ -112,8 +112,8 @@ def _evaluated(
 ) -> Experience:
     settings, rows = roles.settings, len(answers.tokens)
     size = rows if keep else settings.update.micro_batch_size or rows
-    # a folded weight rounds otherwise than weight and adapter apart, which is what trains: in float32 within
-    # the tolerance, in bfloat16 far beyond it
+    # a folded weight rounds differently from weight and adapter apart, which is what trains: in float32 this
+    # is within the tolerance, in bfloat16 far beyond it
     folded = settings.dtype == "float32" and not keep
     with roles.frozen_policy() if folded else contextlib.nullcontext(), torch.set_grad_enabled(keep):
         pieces = [_evaluate(roles, answers, slice(k, k + size)) for k in range(0, rows, size)]
@@ -179,8 +179,8 @@ def rewards_of(
     """What the KL to the reference costs at each token, and the score on the last real one.
 
     The KL is that of the pass that trains, for policy and reference alike: before the first step their
-    log-probabilities are equal to the bit, where those of sampling differ by rounding, which normalised
-    advantages would blow up to full strength.
+    log-probabilities are identical. Those of sampling differ by rounding, which normalised advantages would
+    amplify to full strength.
     """
     mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
     total = torch.from_numpy(np.nan_to_num(scores.total)).to(experience.logp) * settings.reward_scale
@@ -206,7 +206,7 @@ def rewards_of(
     return TokenRewards(torch.where(mask, rewards * scale, 0.0), share, scale)
 
 
-def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: AlignSettings) -> Batch:
+def batch_of(experience: Experience, rewards: Tensor, valid: Tensor, settings: AlignSettings) -> Batch:
     """Advantages and returns of the responses whose score counts (``valid`` [B]), as ppo.update takes
     them.
     """
@@ -241,7 +241,7 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
         one_lambda = settings.lambda_alpha is None and critic_lambda == policy_lambda
         targets = (advantages if one_lambda else estimate(gae_lambda=critic_lambda)) + values
     old = experience.responses.logp if settings.dtype == "float32" else experience.logp
-    inputs = Inputs(
+    inputs = ResponseInputs(
         tokens=experience.tokens,
         real=experience.real,
         ref_logp=experience.ref_logp,

@@ -19,11 +19,11 @@ from tightrope.maths import divergence
 from tightrope.maths.statistics import masked_mean, masked_sum
 
 
-def describe(
+def rollout_metrics(
     experience: Experience, scores: Scores, rewards: Tensor, kl_share: Tensor, valid: Tensor
 ) -> dict[str, float]:
-    """The metrics of a rollout: sums over a response, and token means under names that say so. ``rewards``
-    and the share of the KL in them, before any scaling, are [B, R].
+    """The metrics of a rollout: sums over a response, and means over tokens where the name says so.
+    ``rewards`` and the share of the KL in them, before any scaling, are [B, R].
 
     Scores and rewards are those of the responses that count, everything else is of all of them; NaN for a
     score where none counts.

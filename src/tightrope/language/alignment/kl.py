@@ -49,9 +49,7 @@ Sources: Schulman, http://joschu.net/blog/kl-approx.html; Ziegler et al. 2019, a
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -78,7 +76,7 @@ def kl_rewards(
     reference's. ``exact`` [B, R]: D(s_t), None where the form does not need it. Pure loss forms give 0.
     With exact-split step t pays for the state it leads to, gamma * D(s_{t+1}), and the last step of a
     response for nothing (where the critic continues a cut response, the KL of that one state is left out).
-    ``gamma`` is that of the returns. The counting steps of a row must stand together, from column 0 on.
+    ``gamma`` is that of the returns. The counting steps of a row must be contiguous and start at column 0.
     ValueError when shapes differ, ``exact`` is missing, or the KL of a counting step is not finite.
     """
     exact = _checked(form, logp, ref_logp, exact, mask)
@@ -151,40 +149,18 @@ def shared_scale(advantages: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     return statistics.standardise(advantages, mask), scale.to(advantages.dtype)
 
 
-@dataclass(frozen=True)
-class AdaptiveKL:
-    """Ziegler's controller of kl_beta; frozen, its fields are its whole state (save them, and load them).
+def adapted(kl_beta: float, kl: float, episodes: int, *, target: float, horizon: float) -> float:
+    """kl_beta after ``episodes`` more responses whose mean KL was ``kl`` nats.
 
-    ``target``: nats per response, the *sum* over its tokens; ``horizon``: responses over which kl_beta may
-    change by a fifth. Source: Ziegler et al. 2019, section 2.2 (there target 6, horizon 10000).
+    kl_beta *= 1 + clip(kl / target - 1, -0.2, 0.2) * episodes / horizon. The KL of a response is the *sum*
+    over its tokens: a mean over tokens is far below any target, and kl_beta would only ever fall.
+    ``horizon``, above 0.2 episodes: responses over which kl_beta may change by a fifth. ValueError when the
+    KL is not finite. Source: Ziegler et al. 2019, section 2.2 (there target 6, horizon 10000).
     """
-
-    kl_beta: float
-    target: float
-    horizon: float = 10_000.0
-
-    def __post_init__(self) -> None:
-        """Check the numbers: ValueError unless all are finite and above 0."""
-        for name, value in dataclasses.asdict(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value!r}; an adaptive KL penalty needs a number above 0.")
-
-    def next(self, kl_sequence_sum: float, episodes: int) -> AdaptiveKL:
-        """The controller after ``episodes`` more responses whose mean KL was ``kl_sequence_sum`` nats each.
-
-        kl_beta *= 1 + clip(kl / target - 1, -0.2, 0.2) * episodes / horizon. The KL of a response is the sum
-        over its tokens: a mean over tokens is far below any target, and kl_beta would only ever fall.
-        ValueError when the KL is not finite, or when one call could take kl_beta to 0.
-        """
-        if not math.isfinite(kl_sequence_sum):
-            raise ValueError(f"the KL is {kl_sequence_sum!r}; kl_beta cannot adapt to it.")
-        if LARGEST_CHANGE * episodes >= self.horizon:
-            raise ValueError(
-                f"{episodes} responses at once against a horizon of {self.horizon:g} could take kl_beta to "
-                f"0. Use a horizon above {LARGEST_CHANGE * episodes:g}, or smaller batches."
-            )
-        error = min(max(kl_sequence_sum / self.target - 1, -LARGEST_CHANGE), LARGEST_CHANGE)
-        return dataclasses.replace(self, kl_beta=self.kl_beta * (1 + error * episodes / self.horizon))
+    if not math.isfinite(kl):
+        raise ValueError(f"the KL is {kl!r}; kl_beta cannot adapt to it.")
+    error = min(max(kl / target - 1, -LARGEST_CHANGE), LARGEST_CHANGE)
+    return kl_beta * (1 + error * episodes / horizon)
 
 
 def _checked(form: str, logp: Tensor, ref_logp: Tensor, exact: Tensor | None, mask: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ def sample_rows(
     and ``scores`` each function's own, None where there is none; ``kl`` to the reference in nats, k1 summed
     over the response; ``advantage`` the mean over its tokens, None where the response is masked (``counts``
     False); ``tokens`` its length, ``ended`` whether it closed itself with an EOS; ``extras`` what reward
-    functions logged. ``batch`` holds the rows of ``valid`` [B] alone.
+    functions logged. ``batch`` holds only the rows of ``valid`` [B].
     """
     responses = experience.responses
     log_ratio = experience.ref_logp - experience.logp
@@ -82,7 +82,7 @@ def read_samples(path: str | Path) -> list[dict[str, Any]]:
 
 
 def _is_sample(row: dict[str, Any]) -> bool:
-    """Whether a row has what tables show of it, whoever wrote the file."""
+    """Whether a row has everything that the tables show; the file may come from anywhere."""
     scores = row.get("scores")
     texts = (row.get("prompt"), row.get("response"))
     numbers = [row.get(name) for name in ("score", "kl", "advantage")]
@@ -98,7 +98,7 @@ def _is_sample(row: dict[str, Any]) -> bool:
 def spread(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
     """``count`` rows from the highest score to the lowest at even distances; those without a score come last.
 
-    A look at the best alone hides what happens to the others. ValueError for a count below 1.
+    The best alone would hide what happens to the others. ValueError for a count below 1.
     """
     if count < 1:
         raise ValueError(f"count is {count}, expected at least 1.")
@@ -135,20 +135,13 @@ def print_samples(
     _print_table(["prompt", "response"], heads, lines, stream, width, title, console)
 
 
-def print_comparison(
-    rows: Sequence[dict[str, Any]], stream: TextIO | None = None, *, width: int | None = None, title: str = ""
-) -> None:
-    """A table of responses before and after training: rows of ``prompt``, ``before``, ``after``, and, where
-    there is a reward, ``score_before`` and ``score_after``. ``stream`` and ``width`` as in `print_samples`.
+def print_comparison(rows: Sequence[dict[str, Any]], stream: TextIO | None = None, **options: Any) -> None:
+    """A table of responses before and after training: rows of ``prompt``, ``before`` and ``after``.
+
+    ``stream`` and ``options`` (``width``, ``title``) as in `print_samples`.
     """
-    scored = any(row.get("score_before") is not None or row.get("score_after") is not None for row in rows)
-    lines = []
-    for row in rows:
-        texts = [shown(row["prompt"], tail=True), shown(row["before"]), shown(row["after"])]
-        figures = [figure(row.get("score_before")), figure(row.get("score_after"))] if scored else []
-        lines.append(texts + figures)
-    heads = ["score before", "after"] if scored else []
-    _print_table(["prompt", "before", "after"], heads, lines, stream, width, title)
+    lines = [[shown(row["prompt"], tail=True), shown(row["before"]), shown(row["after"])] for row in rows]
+    _print_table(["prompt", "before", "after"], [], lines, stream, **options)
 
 
 def shown(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
@@ -175,8 +168,8 @@ def _print_table(
     figures: list[str],
     lines: list[list[str]],
     stream: TextIO | None,
-    width: int | None,
-    title: str,
+    width: int | None = None,
+    title: str = "",
     console: Any = None,
 ) -> None:
     from rich.console import Console

@@ -26,7 +26,7 @@ class Example:
 
 
 def positions(real: Tensor) -> Tensor:
-    """Position of every token [B, T]: real tokens count from 0, whatever the padding."""
+    """Position of every token [B, T]: real tokens count from 0, padding does not count."""
     return (real.long().cumsum(1) - 1).clamp(min=0)
 
 
@@ -115,7 +115,7 @@ def row_of(examples: Sequence[Example]) -> Packed:
     return Packed(*(x[None] for x in (tokens, places, segments, learn)))
 
 
-def pack(examples: Sequence[Example], length: int) -> list[Packed]:
+def pack_rows(examples: Sequence[Example], length: int) -> list[Packed]:
     """All examples in rows of at most ``length`` tokens: the longest first, each into the fullest row that
     still holds it (best fit decreasing). ValueError for an example that fits no row.
     """

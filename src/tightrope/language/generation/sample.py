@@ -133,7 +133,7 @@ def draw(
     return chosen, own, support
 
 
-class Step(NamedTuple):
+class CachedPass(NamedTuple):
     """One forward pass: ``hidden`` [B, T, d], the last hidden states, and the cache after it."""
 
     hidden: Tensor
@@ -142,7 +142,7 @@ class Step(NamedTuple):
 
 def cached_forward(
     base: nn.Module, tokens: Tensor, attention_mask: Tensor, positions: Tensor, cache: Any = None
-) -> Step:
+) -> CachedPass:
     """Run ``base`` on ``tokens`` [B, T] with a cache. None starts a new one; a given one grows in place.
 
     ``attention_mask`` [B, T + cached]: 1 for real tokens. ``positions`` [B, T].
@@ -152,4 +152,4 @@ def cached_forward(
     out = base(tokens, attention_mask=attention_mask, position_ids=positions, use_cache=True, **given)
     # asked for by name in this order: reading the old name from a new output warns
     after = out.cache if hasattr(out, NEW) else out.past_key_values
-    return Step(out.last_hidden_state, after)
+    return CachedPass(out.last_hidden_state, after)

@@ -11,7 +11,7 @@ from torch import Tensor
 from tightrope.algorithms.batch import Batch
 from tightrope.language.data.batching import length_groups, used_columns
 from tightrope.language.policy.roles import Roles
-from tightrope.language.policy.rollout import FirstPass, Inputs
+from tightrope.language.policy.rollout import FirstPass, ResponseInputs
 
 
 @dataclass
@@ -48,7 +48,7 @@ class PolicyModel:
 
     def _pass(self, part: Batch) -> FirstPass:
         """One forward pass over some rows."""
-        roles, mask, inputs = self.roles, part.mask, Inputs(**part.inputs)
+        roles, mask, inputs = self.roles, part.mask, ResponseInputs(**part.inputs)
         columns, length = mask.shape[1], inputs.tokens.shape[1]
         left, right = used_columns(inputs.real, mask)
         tokens, real = inputs.tokens[:, left:right], inputs.real[:, left:right]

@@ -41,7 +41,7 @@ class Experience(Completions):
 
 
 @dataclass(frozen=True)
-class Inputs:
+class ResponseInputs:
     """The keys of ``Batch.inputs`` for responses. Rows first.
 
     ``tokens``, ``real`` [B, P + R]; ``ref_logp`` [B, R]; ``row`` [B]: the row in the rollout. ``lower``,

@@ -69,7 +69,7 @@ class Outcome:
     extras: dict[str, list[Any]] = field(default_factory=dict)
 
 
-class Worker:
+class JobThread:
     """A daemon thread that runs one piece of work after the other; it starts with the first one."""
 
     def __init__(self, name: str, at_end: Callable[[], None] = lambda: None) -> None:
@@ -88,8 +88,8 @@ class Worker:
             weakref.finalize(self, self._jobs.put, None)
         future: Future[None] = Future()
         self._jobs.put((future, work))
-        wait([future], timeout)
-        if not future.cancel() and future.done():
+        _, late = wait([future], timeout)
+        if not late or not (future.cancel() or future.running()):
             future.result()
 
 
@@ -99,7 +99,7 @@ def _serve(jobs: queue.SimpleQueue[Any], at_end: Callable[[], None]) -> None:
         if future.set_running_or_notify_cancel():
             try:
                 future.set_result(work())
-            except BaseException as error:  # whatever it is, the caller gets it
+            except BaseException as error:  # the caller gets it
                 future.set_exception(error)
         del job, future, work  # a waiting thread must not keep a batch in memory
     at_end()
@@ -112,10 +112,10 @@ class Caller:
         self, functions: Sequence[RewardFunction], names: Sequence[str], timeout: float | None
     ) -> None:
         self.functions, self.names, self.timeout = functions, names, timeout
-        self._workers = [Worker(f"reward {name}") for name in names]
+        self._workers = [JobThread(f"reward {name}") for name in names]
         # one event loop for all batches: a client that user code keeps belongs to the loop it was made in
         self._loop = asyncio.Runner()
-        self._loop_worker = Worker("async rewards", self._loop.close)
+        self._loop_worker = JobThread("async rewards", self._loop.close)
 
     def outcomes(
         self, offered: dict[str, Any], completions: Sequence[Text], weights: Sequence[float]
@@ -151,6 +151,7 @@ class _Call:
         self._extras: dict[str, list[Any]] = {}
         self._metrics: dict[str, list[float]] = {}
         self._back: list[Any] | BaseException | None = None  # what came back: None, as long as nothing has
+        self.late = False
         copies = {key: _copied(value) for key, value in offered.items()}
         copies |= {"log_extra": self._log_extra, "log_metric": self._log_metric}
         self._arguments = _accepted(name, function, copies)
@@ -172,18 +173,22 @@ class _Call:
         self._metrics.setdefault(str(name), []).append(found)
 
     def run(self) -> None:
-        """Call a plain function, whatever it does; reading its values is part of the call."""
+        """Call a plain function and keep what it returns or raises; its values are read in the call too."""
         try:
-            self._back = _as_list(self.function(**self._arguments), self._count)
+            self._keep(_as_list(self.function(**self._arguments), self._count))
         except (Exception, SystemExit) as error:  # user code: what it raises becomes a fault
-            self._back = error
+            self._keep(error)
 
     async def run_async(self) -> None:
         """The same for an async function."""
         try:
-            self._back = _as_list(await self.function(**self._arguments), self._count)
+            self._keep(_as_list(await self.function(**self._arguments), self._count))
         except (Exception, SystemExit, asyncio.CancelledError) as error:
-            self._back = error
+            self._keep(error)
+
+    def _keep(self, back: list[Any] | BaseException) -> None:
+        if not self.late:  # a late call may return something when it is cancelled
+            self._back = back
 
     def outcome(self, weight: float, completions: Sequence[Text], timeout: float | None) -> Outcome:
         """What came back in time, checked. A score of None is NaN without a fault: the function does not
@@ -208,7 +213,7 @@ class _Call:
         for kind, samples in _read_scores(back, weight, found.scores).items():
             first = back[samples[0]]
             shown = f"the {type(first).__name__} {str(first)[:60]!r}" if kind == "type" else f"{first}"
-            place = where(samples, completions)
+            place = place_of(samples, completions)
             fault(kind, samples, f"returned {shown} for {place}, expected a finite number or None.")
         found.metrics = {
             f"logged/{name}": math.fsum(values) / len(values) for name, values in self._metrics.items()
@@ -221,8 +226,10 @@ async def _all(calls: Sequence[_Call], timeout: float | None) -> None:
     """Run async functions together and cancel those that are late. One that blocks the loop makes all others
     late too: Python runs them in one thread.
     """
-    _, late = await asyncio.wait([asyncio.ensure_future(call.run_async()) for call in calls], timeout=timeout)
+    tasks = {asyncio.ensure_future(call.run_async()): call for call in calls}
+    _, late = await asyncio.wait(tasks, timeout=timeout)
     for task in late:
+        tasks[task].late = True
         task.cancel()
 
 
@@ -247,7 +254,7 @@ def as_number(value: Any) -> float | None:
     try:
         return float(value)
     except OverflowError:
-        return math.inf  # too large for a float, of whichever sign: unusable all the same
+        return math.inf  # too large for a float, of either sign: not usable
 
 
 def describe_error(error: BaseException) -> str:
@@ -262,8 +269,8 @@ def describe_error(error: BaseException) -> str:
     return f"{text} (line {line} of {Path(frames[0].filename).name})"
 
 
-def where(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:
-    """``sample 3 of 64 and 5 more (response 'The film ...')``; counted from 0."""
+def place_of(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:
+    """Samples in words, counted from 0: ``sample 3 of 64 and 5 more (response 'The film ...')``."""
     shown = repr(str(completions[samples[0]])[:60])
     more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
     return f"sample {samples[0]} of {len(completions)}{more} (response {shown})"

@@ -2,9 +2,9 @@
 
     def reward(prompts, completions, completion_ids, **columns) -> list[float | None]
 
-A function may be plain or ``async``; all arguments are passed by keyword. What it may not do is spoil a run:
-one that hangs, raises, or returns NaN or the wrong number of scores ends in a `RewardError` that names it, or
-in samples that are masked and counted, never in a wrong number.
+A function may be plain or ``async``; all arguments are passed by keyword. It cannot spoil a run:
+when it hangs, raises, or returns NaN or the wrong number of scores, the result is a `RewardError` that names
+it, or samples that are masked and counted, never a wrong number.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from tightrope.language.reward.call import (
     Text,
     as_number,
     describe_error,
-    where,
+    place_of,
 )
 
 # What is a mistake in the code raises by default; what the data or the world does masks the samples.
@@ -168,7 +168,7 @@ class Rewards:
                 found.extras[f"{column} ({name})" if column in found.extras else column] = entries
         nobody = np.flatnonzero(~applies & ~broken)
         if len(nobody):
-            text = f"No reward function applies to {where(nobody, completions)}: all returned None."
+            text = f"No reward function applies to {place_of(nobody, completions)}: all returned None."
             found.faults.append(Fault("", "none", tuple(nobody.tolist()), text))
         valid = applies & ~broken
         return dataclasses.replace(found, total=np.where(valid, total, np.nan), valid=valid)
@@ -241,7 +241,7 @@ def load_reward_function(word: str) -> RewardFunction:
     spec = importlib.util.spec_from_file_location(f"reward_file_{path.stem}", path.resolve())
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(path.resolve().parent))  # what lies beside the file can be imported, also later
+    sys.path.insert(0, str(path.resolve().parent))  # files beside it can be imported, also later
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
