@@ -188,7 +188,7 @@ def test_jobs_come_from_the_settings_of_the_commands() -> None:
     assert job_of(SFTSettings(minibatch_size=4, micro_batch_size=8)).micro_batch_size == 4
     pairs = job_of(RewardSettings(micro_batch_size=2))
     assert (pairs.critic, pairs.rows_per_example, pairs.language_head) == ("head", 2, False)
-    with pytest.raises(ValueError, match="ModelSettings is no job"):
+    with pytest.raises(ValueError, match="ModelSettings is not a job"):
         job_of(ModelSettings())
 
 

@@ -355,7 +355,7 @@ def test_pairs_of_one_prompt_are_held_out_together(tmp_path, folder, monkeypatch
 def test_what_is_no_reward_model_is_named(tmp_path, folder):
     from transformers import LlamaConfig, LlamaForSequenceClassification
 
-    with pytest.raises(ValueError, match=r"absent is no reward model: it holds no config.json"):
+    with pytest.raises(ValueError, match=r"absent is not a reward model: it holds no config.json"):
         load_reward(tmp_path / "absent")
     with pytest.raises(ValueError, match="holds LlamaForCausalLM, which gives no scores"):
         load_reward(folder)

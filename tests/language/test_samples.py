@@ -89,7 +89,7 @@ def test_what_is_written_is_read_again(tmp_path):
 
 
 def test_a_run_without_samples_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"samples.jsonl is not there: .* is no run of tightrope align"):
+    with pytest.raises(ValueError, match=r"samples.jsonl is not there: .* is not a run of tightrope align"):
         read_samples(tmp_path)
 
 

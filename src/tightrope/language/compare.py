@@ -56,7 +56,7 @@ def sample_run(
 
 
 def _prompts_of(path: Path, count: int) -> list[Any]:
-    """Prompts that the run answered, the newest first, none twice."""
+    """Prompts that the run answered, the newest first, each once."""
     found: dict[str, Any] = {}
     for row in reversed(read_samples(path)):
         found.setdefault(str(row["prompt"]), row["prompt"])

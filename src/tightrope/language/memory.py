@@ -3,8 +3,8 @@
     peak = what stays + max(while responses are sampled and scored, while gradients are computed)
 
 What stays are the weights of the four roles, their gradients (kept until the next step) and Adam's moments.
-Not counted: Python and torch themselves, a GPU's context, and what the allocator keeps in hand (about a tenth
-on a CPU); `require_fit` leaves room for them.
+Not counted: Python and torch themselves, a GPU's context, and what the allocator holds in reserve (about a
+tenth on a CPU); `require_fit` leaves room for them.
 
 The model is built on torch's meta device from its configuration. What a forward pass keeps for the backward
 pass is measured there too: torch shows every tensor that it saves, at three lengths, and the part that grows
@@ -51,7 +51,7 @@ class Job:
     ``extra_tokens``: tokens of a pretraining loss per micro-batch. ``keeps_float32``: where every weight is
     trained, the weights stay float32 and ``dtype`` lowers copies of them for the arithmetic. ``judges``: name
     and bytes of every reward model with a trunk of its own; ``reward`` separate is one whose size is not
-    known, taken for as large as the policy, in float32.
+    known, assumed to be as large as the policy, in float32.
     """
 
     tune: str = "lora"
@@ -105,7 +105,7 @@ def job_of(
             keeps_exact_kl=settings.exact_in_loss, judges=judges,
         )  # fmt: skip
     if not isinstance(settings, SupervisedSettings):
-        raise ValueError(f"{type(settings).__name__} is no job whose memory is known.")
+        raise ValueError(f"{type(settings).__name__} is not a job whose memory is known.")
     pairs = isinstance(settings, RewardSettings)
     rows = min(settings.micro_batch_size or settings.minibatch_size, settings.minibatch_size)
     return Job(
@@ -351,7 +351,7 @@ def shapes_of(config: Any, dtype: str) -> Shapes:
 
 
 def _linears(layer: nn.Module) -> list[tuple[int, int]]:
-    """The shapes of the weights that an adapter would be put on; GPT-2's Conv1D has [in, out]."""
+    """The shapes of the weights that an adapter would change; GPT-2's Conv1D has [in, out]."""
     kinds = [m for m in layer.modules() if isinstance(m, nn.Linear) or type(m).__name__ == "Conv1D"]
     weights = [m.get_parameter("weight").shape for m in kinds]
     return [(shape[0], shape[1]) for shape in weights]

@@ -1,4 +1,4 @@
-"""The settings of the language story: one frozen dataclass a command, imported without torch."""
+"""The settings of the language story: one frozen dataclass per command, imported without torch."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ class AlignSettings(ModelSettings):
         super().__post_init__()
         if self.batch_size % self.samples_per_prompt:
             raise ValueError(
-                f"batch_size {self.batch_size} is no multiple of samples_per_prompt "
+                f"batch_size {self.batch_size} is not a multiple of samples_per_prompt "
                 f"{self.samples_per_prompt}. Choose one that is."
             )
         if self.kl_goal is not None and not (self.kl_beta > 0 and self.kl_horizon > 0.2 * self.batch_size):

@@ -101,8 +101,8 @@ def resume_align(
     """Continue from a run's newest checkpoint, or from the start where there is none yet. It ends like an
     uninterrupted run, bit for bit.
 
-    Code is never named by a file: a reward that was a function must be given again, and prompts that were no
-    file too. ``total_episodes`` extends a finished run.
+    Code is never named by a file: a reward that was a function must be given again, and so must prompts that
+    were no file. ``total_episodes`` extends a finished run.
     """
     with Run.open(run_dir, own=True) as run:
         settings = AlignSettings.from_json(run.settings, run.path / "settings.json")
@@ -129,7 +129,7 @@ def _require_what_no_file_gives(
             )
     if prompts is None and not Path(settings.data).is_file():
         raise ValueError(
-            f"The prompts of {run_dir} were {settings.data!r}, which is no file. Give them again: "
+            f"The prompts of {run_dir} were {settings.data!r}, which is not a file. Give them again: "
             f"tightrope resume {shlex.quote(str(run_dir))} --data PROMPTS.jsonl"
         )
 

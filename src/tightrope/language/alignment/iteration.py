@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -56,6 +56,11 @@ from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors, put_back, tensors_of
+
+# what a checkpoint holds of a trainer as it is, and how it is read back
+SAVED: dict[str, Callable[[Any], Any]] = {
+    "episodes": int, "iteration": int, "kl_beta": float, "stopped": bool, "seconds": float, "newest": figures,
+}  # fmt: skip
 
 
 class Trainer:
@@ -199,20 +204,14 @@ class Trainer:
 
     def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
         """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
-        state: dict[str, Any] = {
+        state: dict[str, Any] = {name: getattr(self, name) for name in SAVED} | {
             "story": "align",
-            "episodes": self.episodes,
-            "iteration": self.iteration,
-            "kl_beta": self.kl_beta,
             "rollbacks": self.rollbacks,
             "micro_batch_size": self.micro_batch_size,
             "prompt_position": self.order.position,
             "prompts_sha256": self._hash_of_prompts(),
             "rng": {"update": self.update_rng.bit_generator.state},
             "monitor": self.monitor.state(),
-            "stopped": self.stopped,
-            "newest": self.newest,
-            "seconds": self.seconds,
         }
         if self.pretraining is not None:
             state["rng"]["ptx"] = self.pretraining.rng.bit_generator.state
@@ -224,7 +223,7 @@ class Trainer:
         """
         folder, tensors, state = point
         if state.get("story") != "align":
-            raise ValueError(f"{folder} is no checkpoint of an alignment run.")
+            raise ValueError(f"{folder} is not a checkpoint of an alignment run.")
         if state.get("prompts_sha256") != self._hash_of_prompts():
             raise ValueError(
                 f"{folder} is of a run with other prompts than these {len(self.prompts):,}. Give those that "
@@ -232,17 +231,13 @@ class Trainer:
             )
         with understood(folder):
             put_back(tensors, self.roles.parameters(), self.optimiser)
-            self.episodes = int(state["episodes"])
-            self.iteration = int(state["iteration"])
-            self.kl_beta = float(state["kl_beta"])
+            for name, read in SAVED.items():
+                setattr(self, name, read(state[name]))
             self.rollbacks = int(state.get("rollbacks", 0))
             self.micro_batch_size = state.get("micro_batch_size", self.micro_batch_size)
             self.order.position = int(state["prompt_position"])
             self.update_rng.bit_generator.state = state["rng"]["update"]
             self.monitor.restore(state["monitor"])
-            self.stopped = bool(state["stopped"])
-            self.seconds = float(state["seconds"])
-            self.newest = figures(state["newest"])
             if self.pretraining is not None:
                 self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 

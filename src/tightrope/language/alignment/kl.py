@@ -92,33 +92,6 @@ def kl_rewards(
         return torch.where(mask, -kl_beta * kl, 0.0)
 
 
-def kl_steps(
-    form: str,
-    logp: Tensor,
-    ref_logp: Tensor,
-    exact: Tensor | None,
-    mask: Tensor,
-    log_ratio: Tensor | None = None,
-) -> Tensor | None:
-    """The KL per step of which a form puts the gradient into the loss, [B, R]; None: a reward form.
-
-    0 where masked. ``logp`` and ``exact`` are of the policy as it is now, with their graphs. ``log_ratio``
-    [B, R] = log pi / pi_old, no gradient flows through it: k2 is weighted with pi / pi_old, which keeps its
-    expected gradient right when the policy has moved since it sampled. None: no weights, which is right only
-    in the first step. The exact forms need none. ValueError when shapes differ or ``exact`` is missing.
-    """
-    exact = _checked(form, logp, ref_logp, exact, mask)
-    if form == "k1-reward":
-        return None
-    if form != "k2-loss":
-        return torch.where(mask, exact, 0.0)
-    kl = divergence.k2(_log_ratio(logp, ref_logp.detach(), mask))
-    if log_ratio is None:
-        return kl
-    require_same_shape(log_ratio=log_ratio, mask=mask)
-    return kl * torch.where(mask, log_ratio.detach(), 0.0).exp()
-
-
 def kl_loss(
     form: str,
     logp: Tensor,
@@ -128,13 +101,24 @@ def kl_loss(
     count: float | Tensor,
     log_ratio: Tensor | None = None,
 ) -> Tensor | None:
-    """The mean of `kl_steps` over a minibatch, a scalar to be multiplied by kl_beta; None: a reward form.
+    """The mean KL of a minibatch, a scalar to be multiplied by kl_beta; None for k1-reward: it has no loss.
 
-    sum over the counting steps at hand / ``count``, the number of counting steps of the WHOLE minibatch: the
-    scale of ppo.update's own policy loss, so that kl_beta weighs it against rewards, and parts add up.
+    sum over the counting steps given here / ``count``, the number of counting steps of the WHOLE minibatch.
+    This is the scale of ppo.update's own policy loss: kl_beta weighs it against rewards, and parts add up.
+    ``logp`` and ``exact`` are of the policy as it is now, with their graphs. ``log_ratio`` [B, R] =
+    log pi / pi_old, no gradient flows through it: k2 is weighted with pi / pi_old, which keeps its expected
+    gradient right when the policy has moved since it sampled. None: no weights, which is right only in the
+    first step. The exact forms need none. ValueError when shapes differ or ``exact`` is missing.
     """
-    steps = kl_steps(form, logp, ref_logp, exact, mask, log_ratio)
-    return None if steps is None else statistics.masked_mean(steps, mask, count)
+    steps = _checked(form, logp, ref_logp, exact, mask)
+    if form == "k1-reward":
+        return None
+    if form == "k2-loss":
+        steps = divergence.k2(_log_ratio(logp, ref_logp.detach(), mask))
+        if log_ratio is not None:
+            require_same_shape(log_ratio=log_ratio, mask=mask)
+            steps = steps * torch.where(mask, log_ratio.detach(), 0.0).exp()
+    return statistics.masked_mean(steps, mask, count)
 
 
 def shared_scale(advantages: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

@@ -73,11 +73,11 @@ def read_samples(path: str | Path) -> list[dict[str, Any]]:
     path = Path(path)
     file = path / "samples.jsonl" if path.is_dir() else path
     if not file.is_file():
-        raise ValueError(f"{file} is not there: {path} is no run of tightrope align, or has not begun.")
+        raise ValueError(f"{file} is not there: {path} is not a run of tightrope align, or has not begun.")
     rows = read_lines(file)
     for number, row in enumerate(rows):
         if not _is_sample(row):
-            raise ValueError(f"{file}, row {number}, is no response as tightrope align records them.")
+            raise ValueError(f"{file}, row {number}, is not a response as tightrope align records it.")
     return rows
 
 

@@ -75,7 +75,7 @@ def length_groups(real: Tensor, mask: Tensor) -> list[Tensor]:
 
 def used_columns(real: Tensor, mask: Tensor) -> tuple[int, int]:
     """The columns [left, right) of [B, P + R] whose states matter: from the first real prompt token to the
-    token before the last counting one, in whose state that is chosen.
+    token before the last counting one, whose state decides that last token.
     """
     prompt = real.shape[1] - mask.shape[1]
     any_prompt = real[:, :prompt].any(0).nonzero()

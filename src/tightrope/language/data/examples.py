@@ -90,9 +90,12 @@ def _read_file(path: Path) -> list[Any]:
         with open(path, encoding="utf-8-sig", newline="" if kind == ".csv" else None) as file:
             if kind == ".csv":
                 return _table(file, path)
-            lines = file.read().split("\n") if kind != ".json" else []
             if kind == ".json":
-                return _list(json.load(file, object_pairs_hook=partial(_unique, str(path))), path)
+                value = json.load(file, object_pairs_hook=partial(_unique, str(path)))
+                if not isinstance(value, list):
+                    raise ValueError(f"{path} holds {type(value).__name__}; expected a list of objects.")
+                return value
+            lines = file.read().split("\n")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not UTF-8 text ({error}). Convert it.") from error
     except (json.JSONDecodeError, csv.Error) as error:
@@ -115,7 +118,7 @@ def _object(line: str, place: str) -> Any:
 
 
 def _unique(place: str, pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of its pairs. ValueError for a key that is there twice: one of its values would be lost."""
+    """An object of its pairs. ValueError for a duplicate key: one of its values would be lost."""
     _each_once([key for key, _ in pairs], place)
     return dict(pairs)
 
@@ -126,12 +129,6 @@ def _each_once(names: Sequence[str], place: str) -> None:
         raise ValueError(
             f"{place} names {twice!r} twice; expected every column once. Rename one, or take it out."
         )
-
-
-def _list(value: Any, path: Path) -> list[Any]:
-    if not isinstance(value, list):
-        raise ValueError(f"{path} holds {type(value).__name__}; expected a list of objects.")
-    return value
 
 
 def _table(file: Iterable[str], path: Path) -> list[Any]:

@@ -35,7 +35,7 @@ class Encoder:
 
     def reply(self, prompt: str, completion: str) -> tuple[list[int], list[int]]:
         """Prompt and completion of plain text: together, as the tokenizer writes them, where that leaves the
-        prompt as it is; apart where a token would reach across.
+        prompt as it is; apart where a token would span both.
         """
         before, whole = self.text(prompt), self.text(prompt + completion)
         apart = whole[: len(before)] != before
@@ -174,7 +174,7 @@ def shared(first: Sequence[Any], second: Sequence[Any]) -> int:
 
 
 def has(row: dict[str, Any], *columns: str) -> bool:
-    """Whether a row has all of these columns; one that holds None is not there."""
+    """Whether a row has all of these columns; one that holds None does not count."""
     return all(row.get(column) is not None for column in columns)
 
 

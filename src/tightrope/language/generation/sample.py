@@ -1,4 +1,4 @@
-"""Responses from a causal language model: one prefill of each prompt, then a token a step from the KV cache.
+"""Responses from a causal language model: a prefill of each prompt, then one token per step by KV cache.
 
 Each row's tokens come from uniform numbers of its own, drawn beforehand, so that a response does not depend
 on which rows are sampled beside it or have finished before it.
@@ -118,7 +118,7 @@ def sample(
 def draw(
     hidden: Tensor, head: nn.Linear, sampling: Sampling, uniforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """One token a row from hidden states [N, d]: ids, log-probabilities [N], and with top-k its support."""
+    """One token per row from hidden states [N, d]: ids, log-probabilities [N], and with top-k its support."""
     logits, support = next_logits(hidden, head, sampling), None
     if sampling.top_k:
         logits, support = logits.topk(min(sampling.top_k, logits.shape[1]), dim=1)

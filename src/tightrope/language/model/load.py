@@ -95,7 +95,7 @@ def without_dropout(model: nn.Module) -> None:
 
 
 def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
-    """Every token that ends a response: those the model's generation settings name, else the tokenizer's.
+    """Every token that ends a response: those in the model's generation settings, else the tokenizer's.
 
     The tokenizer's own comes first: it is the one that training data is closed with.
     """
@@ -190,7 +190,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
-            raise ValueError("it is no regular file")
+            raise ValueError("it is not a regular file")
         value = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=each_key_once)
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not readable as JSON ({error}).") from error

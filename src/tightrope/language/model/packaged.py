@@ -46,7 +46,7 @@ def find_model(name: str) -> str:
 
 
 def _unpack_glass(package: Path, folder: Path) -> None:
-    """glassllm: 852,608 trained parameters in an .npz, the very architecture of a Llama."""
+    """glassllm: 852,608 trained parameters in an .npz, the same architecture as Llama."""
     import numpy as np
     from transformers import LlamaConfig, LlamaForCausalLM
 

@@ -114,7 +114,7 @@ def make_roles(
     *,
     own_reward: bool = False,
 ) -> Roles:
-    """Load and arrange the models. ``reward_adapter``: a reward model's adapter for this very trunk;
+    """Load and arrange the models. ``reward_adapter``: a reward model's adapter for the same trunk;
     ``own_reward``: the reward is a model with a trunk of its own, which will be loaded beside them.
 
     The memory ledger is handed to ``notify`` before anything large is loaded; what cannot fit is a

@@ -2,7 +2,7 @@
 
 Python cannot kill a thread. A call that is not back at its deadline is left behind in a daemon thread, which
 stops neither the program nor the end of the process; what it returns later is thrown away. A plain function
-is not called again before it is back, so that at most one thread a function is lost.
+is not called again before it is back, so that at most one thread per function is lost.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Fault:
 
 
 class NoScores(Exception):
-    """What a function returned is no list of scores; the message follows the function's name."""
+    """What a function returned is not a list of scores; the message follows the function's name."""
 
     def __init__(self, kind: FaultKind, text: str) -> None:
         super().__init__(text)
@@ -59,7 +59,7 @@ class NoScores(Exception):
 @dataclass(eq=False)
 class Outcome:
     """What one function gave for a batch: ``scores`` [B] float64, NaN where it gave none; why it failed
-    (``faults``, one a kind, and the ``error`` that was raised); and what it logged.
+    (``faults``, one per kind, and the ``error`` that was raised); and what it logged.
     """
 
     scores: np.ndarray
@@ -77,7 +77,7 @@ class JobThread:
         self._jobs: queue.SimpleQueue[Any] | None = None
 
     def run(self, work: Callable[[], None], timeout: float | None) -> None:
-        """Wait until ``work()`` is done, at most ``timeout`` seconds, in which earlier work has to end too.
+        """Wait until ``work()`` is done, at most ``timeout`` seconds, earlier work included.
 
         Work that has not begun by then never begins. Raises what ``work`` raises.
         """
@@ -241,7 +241,7 @@ def is_async(function: RewardFunction) -> bool:
 
 
 def as_number(value: Any) -> float | None:
-    """A score as a float, None for None. TypeError for what is no real number.
+    """A score as a float, None for None. TypeError for what is not a real number.
 
     Whole numbers, truth values and scalars of numpy and torch are numbers; text is none, also "0.5".
     """
@@ -250,7 +250,7 @@ def as_number(value: Any) -> float | None:
     if hasattr(value, "item") and getattr(value, "shape", None) == ():
         value = value.item()
     if not isinstance(value, numbers.Real):
-        raise TypeError(f"{value!r} is no number")
+        raise TypeError(f"{value!r} is not a number")
     try:
         return float(value)
     except OverflowError:

@@ -53,7 +53,7 @@ class Scores:
     NaN where it does not apply or failed. ``metrics``, under declared names: the mean of each part
     (``scores/NAME``), what log_metric got (``logged/NAME``), and how many samples a function failed to score
     (``rewards/NAME/errors``, ``rewards/NAME/timeouts``; absent: none). ``extras``:
-    columns of B entries from log_extra. ``faults``: why samples are masked, one a function and kind.
+    columns of B entries from log_extra. ``faults``: why samples are masked, one per function and kind.
     """
 
     total: np.ndarray
@@ -68,13 +68,14 @@ class Rewards:
     """Several reward functions with weights, as one.
 
     ``functions``: callables or (callable, weight) pairs. ``names``: one each; by default the functions' own.
-    ``timeout``: seconds a function may take for a batch. One that takes longer is left behind in a thread
+    ``timeout``: seconds a function may take for a batch. One that takes longer is left in a thread
     (Python cannot kill one) and its samples are masked. None: no limit, and plain functions run in the
     caller's thread. ``on_error``: "mask" masks and counts the samples of every fault, "raise" raises
     RewardError for every fault; None raises for mistakes in the code (exceptions, wrong length, wrong type)
-    and masks for what data and world do (NaN, infinity, timeouts). None among the scores is no fault: the
-    function does not apply to that sample. A sample that no function applies to is always masked. ``alone``
-    False: something else scores the responses too, and batches to which no function applies are no error.
+    and masks for what the data or the outside world does (NaN, infinity, timeouts). A score of None is no
+    fault: the function does not apply to that sample. A sample that no function applies to is always masked.
+    ``alone`` False: something else scores the responses too, and batches to which no function applies are no
+    error.
 
     Raises ValueError for no function, something that cannot be called, a weight that is not finite, names
     that do not fit.
@@ -187,7 +188,7 @@ class Rewards:
 
 
 def checked_weight(weight: Any) -> float:
-    """The weight as a float. ValueError for what is no finite number."""
+    """The weight as a float. ValueError for what is not a finite number."""
     value = None if isinstance(weight, str) else as_number(weight)
     if value is None or not math.isfinite(value):
         raise ValueError(f"The weight of a reward function is {weight!r}, expected a finite number.")

@@ -47,7 +47,7 @@ class Judge:
         self.weight = weight
 
     def __call__(self, prompts: Sequence[Prompt], answers: Completions, trainer_state: Any = None) -> Scores:
-        """Scores of the responses to ``prompts``, one prompt a response."""
+        """Scores of the responses to ``prompts``, one prompt per response."""
         found = self._of_functions(prompts, answers, trainer_state)
         try:
             learnt = self._of_model(answers)
@@ -235,7 +235,7 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
     if folder is None or head is None or kind == "head" or (kind == "adapter" and judge.adapter is None):
         raise ValueError(
             f"critic_from_reward with critic {kind!r}: expected the folder of a reward model as reward and "
-            "critic separate, or critic adapter with a reward adapter on the very model that is aligned "
+            "critic separate, or critic adapter with a reward adapter on the same model that is aligned "
             "(tightrope reward --tune lora). Choose one, or leave critic_from_reward out."
         )
     if kind == "adapter" and judge.adapter is not None:

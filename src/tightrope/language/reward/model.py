@@ -64,7 +64,7 @@ def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> Rewar
     path = path / "model" if (path / "model" / "config.json").is_file() else path
     if not (path / "config.json").is_file():
         raise ValueError(
-            f"{folder} is no reward model: it holds no config.json. Train one: tightrope reward."
+            f"{folder} is not a reward model: it holds no config.json. Train one: tightrope reward."
         )
     kinds = read_object(path / "config.json").get("architectures") or ["nothing named"]
     if not kinds[0].endswith("ForSequenceClassification"):  # loading would make up a head

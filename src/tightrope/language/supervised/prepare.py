@@ -112,7 +112,7 @@ def load_for_training(
 def precision(settings: SupervisedSettings) -> Iterator[None]:
     """The arithmetic of one forward pass: bfloat16 over float32 weights where all of them are trained.
 
-    Never around a step of the optimiser: inside, torch keeps the lowered weights it has made.
+    Never use it around a step of the optimiser: torch keeps the lowered weights that it made inside.
     """
     lowered = settings.tune == "full" and settings.dtype == "bfloat16"
     with torch.autocast(torch.device(settings.device).type, torch.bfloat16, enabled=lowered):
