@@ -12,7 +12,7 @@ import torch
 from language.test_roles import PROMPTS, fresh, settings, shake
 from language.tiny import saved, tiny_llama
 
-from tightrope.language.alignment.experience import batch_of, comparable, gather, rewards_of
+from tightrope.language.alignment.experience import batch_of, gather, has_baseline, rewards_of
 from tightrope.language.alignment.figures import rollout_metrics
 from tightrope.language.alignment.iteration import PolicyModel
 from tightrope.language.reward.functions import Scores
@@ -272,5 +272,5 @@ def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(fol
 
 def test_a_response_without_a_sibling_that_counts_is_compared_with_nobody():
     valid = np.array([True, False, False, True, True, True, True, False, False])
-    assert comparable(valid, 3).tolist() == [False] * 3 + [True] * 3 + [False] * 3
-    assert comparable(np.array([True, True, False]), 3).tolist() == [True, True, False]
+    assert has_baseline(valid, 3).tolist() == [False] * 3 + [True] * 3 + [False] * 3
+    assert has_baseline(np.array([True, True, False]), 3).tolist() == [True, True, False]

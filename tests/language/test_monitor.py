@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.stats import linregress
 
-from tightrope.language.alignment.monitor import FEWEST_POINTS, TREND_WINDOWS, Monitor, fit, rising
+from tightrope.language.alignment.monitor import FEWEST_POINTS, TREND_WINDOWS, Monitor, fit, trend_p_value
 
 ALPHA, BETA, OFFSET = 1.0, 0.4, -0.3
 PEAK_KL = math.exp(ALPHA / BETA - 1) ** 2  # 20.1 nats
@@ -277,9 +277,9 @@ def test_rising_is_the_one_sided_test_of_regression(values):
     result = linregress(np.arange(len(values)), values)
     assume(abs(result.rvalue) < 1 - 1e-9)
     expected = result.pvalue / 2 if result.slope > 0 else 1 - result.pvalue / 2
-    assert rising(np.array(values)) == pytest.approx(expected, abs=1e-6)
+    assert trend_p_value(np.array(values)) == pytest.approx(expected, abs=1e-6)
 
 
 def test_rising_of_straight_lines():
     steps = np.arange(6.0)
-    assert (rising(steps), rising(-steps), rising(0 * steps)) == (0.0, 1.0, 1.0)
+    assert (trend_p_value(steps), trend_p_value(-steps), trend_p_value(0 * steps)) == (0.0, 1.0, 1.0)

@@ -14,11 +14,11 @@ import torch
 from tightrope.algorithms.batch import Batch
 from tightrope.language.alignment.samples import (
     LONGEST,
+    one_line,
     print_comparison,
     print_samples,
     read_samples,
     sample_rows,
-    shown,
     spread,
 )
 from tightrope.language.reward.functions import Scores
@@ -141,11 +141,15 @@ def test_the_comparison_shows_both_responses():
 
 def test_long_texts_keep_the_end_of_a_prompt_and_the_beginning_of_a_response():
     text = "".join(str(i % 10) for i in range(LONGEST)) + "!"
-    assert shown(text).startswith("0123") and shown(text).endswith("...") and len(shown(text)) == LONGEST
-    assert shown(text, tail=True).endswith("!") and len(shown(text, tail=True)) == LONGEST
-    assert shown(text[:-1]) == text[:-1]
+    assert (
+        one_line(text).startswith("0123")
+        and one_line(text).endswith("...")
+        and len(one_line(text)) == LONGEST
+    )
+    assert one_line(text, tail=True).endswith("!") and len(one_line(text, tail=True)) == LONGEST
+    assert one_line(text[:-1]) == text[:-1]
 
 
 def test_messages_are_shown_with_their_speakers():
     chat = [{"role": "system", "content": "Be kind."}, {"role": "user", "content": "Hi"}]
-    assert shown(chat) == r"system: Be kind.\nuser: Hi"
+    assert one_line(chat) == r"system: Be kind.\nuser: Hi"

@@ -223,7 +223,7 @@ def batch_of(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
     else:
         following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], 1)
         following = torch.where(ended, experience.final_values[:, None], following)
-        policy_lambda: Any = update.gae_lambda
+        policy_lambda: float | Tensor = update.gae_lambda
         if settings.lambda_alpha is not None:
             policy_lambda = length_lambda(mask.sum(1), settings.lambda_alpha)
         critic_lambda = update.gae_lambda if settings.critic_lambda is None else settings.critic_lambda
@@ -260,7 +260,7 @@ def length_lambda(lengths: Tensor, alpha: float) -> Tensor:
     return (1.0 - 1.0 / (alpha * lengths.float())).clamp(min=0.0)
 
 
-def comparable(valid: np.ndarray, samples: int) -> np.ndarray:
+def has_baseline(valid: np.ndarray, samples: int) -> np.ndarray:
     """Of responses whose score counts [B], those that another response to the same prompt, whose score counts
     too, can be compared with.
     """

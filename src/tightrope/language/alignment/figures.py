@@ -63,14 +63,14 @@ def rollout_metrics(
         "objective/eos_fraction": float(ended.float().mean()),
         "objective/truncated_fraction": float((~ended).float().mean()),
         "objective/masked_samples": float((~valid).sum()),
-        "objective/distinct_2": distinct(experience.ids),
+        "objective/distinct_2": distinct_ngrams(experience.ids),
         "objective/sampling_gap": float(gap.max()) if gap.numel() else 0.0,
         "time/generate_seconds": experience.seconds,
         "time/tokens_per_second": float(mask.sum()) / max(experience.seconds, 1e-9),
     }
 
 
-def distinct(rows: list[list[int]], n: int = 2) -> float:
+def distinct_ngrams(rows: list[list[int]], n: int = 2) -> float:
     """Distinct n-grams / all n-grams over a batch: falls towards 0 when responses repeat themselves."""
     grams = [tuple(row[k : k + n]) for row in rows for k in range(len(row) - n + 1)]
     return len(set(grams)) / len(grams) if grams else 1.0

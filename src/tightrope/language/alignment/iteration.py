@@ -19,8 +19,8 @@ from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
 from tightrope.language.alignment.experience import (
     PromptOrder,
     batch_of,
-    comparable,
     gather,
+    has_baseline,
     respond,
     rewards_of,
 )
@@ -290,7 +290,7 @@ class Trainer:
         scored = time.perf_counter()
         self._warn_of_faults(scores)
         if settings.critic == "none":
-            scores.valid[:] = comparable(scores.valid, settings.samples_per_prompt)
+            scores.valid[:] = has_baseline(scores.valid, settings.samples_per_prompt)
         found = rewards_of(experience, scores, settings, self.kl_beta)
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
         batch = batch_of(experience, found.rewards, valid, settings)

@@ -219,7 +219,7 @@ class Monitor:
         scored = [(proxy, gold) for _, proxy, gold in self._points if math.isfinite(proxy)]
         for window in TREND_WINDOWS:
             proxy, gold = np.array(scored[-window:]).reshape(-1, 2).T
-            if len(proxy) < window or rising(proxy) >= SIGNIFICANCE or rising(-gold) >= SIGNIFICANCE:
+            if len(proxy) < window or max(trend_p_value(proxy), trend_p_value(-gold)) >= SIGNIFICANCE:
                 continue
             text = (
                 f"Over {window} evaluations the score rose from {proxy[0]:.3g} to {proxy[-1]:.3g} while the "
@@ -230,7 +230,7 @@ class Monitor:
         return None
 
 
-def rising(values: np.ndarray) -> float:
+def trend_p_value(values: np.ndarray) -> float:
     """The chance that values [N >= 3] without a trend have a slope at least as steep upwards: Student's t
     test of the least-squares line over their order, one-sided.
     """

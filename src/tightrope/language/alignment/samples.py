@@ -128,10 +128,9 @@ def print_samples(
     heads = [*names, *(["score"] if len(names) > 1 else []), "KL", "advantage"]
     lines = []
     for row in rows:
-        figures = [row["scores"].get(name) for name in names]
-        figures += [row["score"]] if len(names) > 1 else []
-        lines.append([shown(row["prompt"], tail=True), shown(row["response"]), *map(figure, figures)])
-        lines[-1] += [figure(row["kl"]), figure(row["advantage"]) if row["counts"] else "masked"]
+        scores = [row["scores"].get(name) for name in names] + [row["score"]] * (len(names) > 1)
+        advantage = row["advantage"] if row["counts"] else "masked"
+        lines.append([row["prompt"], row["response"], *scores, row["kl"], advantage])
     _print_table(["prompt", "response"], heads, lines, stream, width, title, console)
 
 
@@ -140,11 +139,11 @@ def print_comparison(rows: Sequence[dict[str, Any]], stream: TextIO | None = Non
 
     ``stream`` and ``options`` (``width``, ``title``) as in `print_samples`.
     """
-    lines = [[shown(row["prompt"], tail=True), shown(row["before"]), shown(row["after"])] for row in rows]
+    lines = [[row["prompt"], row["before"], row["after"]] for row in rows]
     _print_table(["prompt", "before", "after"], [], lines, stream, **options)
 
 
-def shown(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
+def one_line(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
     """A text or messages in one short line for a table.
 
     Line ends and other characters that cannot be seen are written as Python writes them. The beginning is
@@ -158,7 +157,7 @@ def shown(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
     return "..." + line[3 - LONGEST :] if tail else line[: LONGEST - 3] + "..."
 
 
-def figure(value: float | None) -> str:
+def short_number(value: float | None) -> str:
     """A number in few characters, ``-`` for none."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
 
@@ -166,7 +165,7 @@ def figure(value: float | None) -> str:
 def _print_table(
     texts: list[str],
     figures: list[str],
-    lines: list[list[str]],
+    lines: list[list[Any]],
     stream: TextIO | None,
     width: int | None = None,
     title: str = "",
@@ -178,11 +177,13 @@ def _print_table(
 
     table = Table(title=title or None, title_justify="left", show_lines=True, highlight=False)
     for name in texts:
-        table.add_column(Text(shown(name)), ratio=1, overflow="fold")
+        table.add_column(Text(one_line(name)), ratio=1, overflow="fold")
     for name in figures:
-        table.add_column(Text(shown(name)), justify="right", no_wrap=True)
-    for line in lines:
-        table.add_row(*[Text(cell) for cell in line])  # Text: brackets in a response are not markup
+        table.add_column(Text(one_line(name)), justify="right", no_wrap=True)
+    for prompt, *cells in lines:
+        shown = [one_line(x) if isinstance(x, str | list) else short_number(x) for x in cells]
+        # Text: brackets in a response are not markup
+        table.add_row(*map(Text, [one_line(prompt, tail=True), *shown]))
     console = console or Console(file=stream, width=width, markup=False, highlight=False)
     console.print(table)
 
