@@ -128,7 +128,7 @@ def test_what_cannot_judge_is_named(sampled, tmp_path):
     for reward, message in [
         ([good, good], "Two reward models were given"),
         (other, "reads .* tokens, the policy writes .* others"),
-        (str(tmp_path), "is no reward model"),
+        (str(tmp_path), "is not a reward model"),
         (3, "reward is 3; expected a function"),
         ((good, "x"), "expected a finite number"),
     ]:
