@@ -34,7 +34,7 @@ from tightrope.training.parameters import Tensors, put_back, tensors_of
 
 @dataclass(frozen=True)
 class Objective:
-    """What is learnt from ``items``.
+    """What is learnt from ``items``: ``parameters`` are trained, ``data`` describes the items in words.
 
     ``loss(items)`` is the loss summed over their terms, and sums of further figures by name; ``count(item)``
     its number of terms, ``length(item)`` its tokens. Metrics are named ``name/...``, those of the optimiser
@@ -51,6 +51,8 @@ class Objective:
     evaluate: Callable[[], dict[str, float]]
     save: Callable[[Path, dict[str, float]], dict[str, Any]] = lambda folder, newest: {}
     seen: str | None = None
+    parameters: Sequence[nn.Parameter] = ()
+    data: str = ""
 
 
 class SupervisedLearner:
@@ -61,15 +63,14 @@ class SupervisedLearner:
     def __init__(
         self,
         objective: Objective,
-        parameters: Sequence[nn.Parameter],
         settings: SupervisedSettings,
         lines: Sequence[str] = (),
     ) -> None:
         self.objective = objective
-        self.parameters = parameters
+        self.parameters = objective.parameters
         self.settings = settings
         self.lines = list(lines)
-        group = {"params": list(parameters), "lr": settings.learning_rate}
+        group = {"params": list(objective.parameters), "lr": settings.learning_rate}
         self.optimiser = Adam([group], eps=1e-8, fused=True)
         self.steps_per_epoch = math.ceil(len(objective.items) / settings.minibatch_size)
         self.step = 0
@@ -175,7 +176,7 @@ class SupervisedLearner:
         if before != items:
             raise ValueError(
                 f"{folder.parent.parent} was learning from {before} examples, the data now have {items}. "
-                "Give the data that the run began with, or begin a new run."
+                "Give the data that the run started with, or start a new run."
             )
 
     def roll_back(self, point: Checkpoint) -> None:
@@ -201,8 +202,8 @@ class SupervisedLearner:
 def minibatches(
     items: Sequence[Item], settings: SupervisedSettings, rollbacks: int = 0
 ) -> Iterator[list[Item]]:
-    """Those of every step, in order: a function of the seed and the number of rollbacks only, wherever a run
-    is stopped. In the epoch of a rollback some examples come twice and others not at all.
+    """Those of every step, in order: a function of only the seed and the number of rollbacks, also after a
+    resume. In the epoch of a rollback some examples come twice and others not at all.
     """
     rng = np.random.default_rng([settings.seed, rollbacks] if rollbacks else settings.seed)
     size = settings.minibatch_size
