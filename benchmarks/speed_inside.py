@@ -46,8 +46,8 @@ def breakdown(scenario: dict[str, Any], rollouts: int) -> dict[str, Any]:
     for _ in range(WARM_ROLLOUTS):
         next(updates)
     seconds: Counter[str] = Counter()
-    clocked(agent.environments, "begin", "env", seconds)
-    clocked(agent.environments, "finish", "env", seconds)
+    clocked(agent.environments, "send", "env", seconds)
+    clocked(agent.environments, "receive", "env", seconds)
     clocked(agent.engine, "act", "act", seconds)
     clocked(agent.engine, "values", "advantages", seconds)
     clocked(agent.engine, "gae", "advantages", seconds)

@@ -13,15 +13,14 @@
     ├── EnvironmentFault                RuntimeError        an environment failed, hung or died
     ├── ApiBreak                                            internal: becomes an EnvironmentFault
     ├── RewardError                     ValueError          a reward function cannot be used
-    ├── NoScores                                            internal: becomes a masked sample
-    └── Overdue (language)                                  internal: a reward call took too long
+    └── NoScores                                            internal: becomes a masked sample
 
 Each class also inherits the builtin beside it, so ``except ValueError`` still catches what it caught. A
 setting or an argument with a wrong value raises a plain ValueError, as in the standard library.
 
-Two classes are no errors and stay outside: `runs.signals.Stopped` (a KeyboardInterrupt) and the `Overdue` of
-environments (a BaseException). They end a run or a call from outside. ``except Exception`` in the code of a
-user must not catch them, and neither must ``except TightropeError``.
+Two classes are not errors and stay outside: `runs.signals.Stopped` (a KeyboardInterrupt) and
+`EnvironmentTimeout` (a BaseException). They end a run or a call from outside. ``except Exception`` in the code
+of a user must not catch them, and neither must ``except TightropeError``.
 """
 
 __all__ = ["TightropeError"]

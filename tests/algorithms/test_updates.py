@@ -12,7 +12,9 @@ from algorithms.models import TinyModel, make_batch
 
 from tightrope.algorithms import a2c, ppo, reinforce
 from tightrope.algorithms.batch import Evaluation
-from tightrope.algorithms.optimise import NonFiniteError, SamplingMismatch, make_optimiser
+from tightrope.algorithms.descent import SamplingMismatch
+from tightrope.algorithms.nonfinite import NonFiniteError
+from tightrope.algorithms.optimise import make_optimiser
 from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings
 from tightrope.maths.statistics import masked_mean
 

@@ -164,7 +164,7 @@ def of_runs() -> list[Attack]:
         Attack("model names nothing", edit("settings.json", model=f"../{MARK}.py"), "There is no model"),
         Attack("empty state", forge(monitor=..., rng=...), "does not hold"),
         Attack("gold_point is text", forge(gold_point=MARK, kl_beta=MARK), "does not hold"),
-        Attack("another story", forge(story=MARK), "no checkpoint of an alignment run"),
+        Attack("another story", forge(story=MARK), "not a checkpoint of an alignment run"),
         Attack("forged pickle as state.json", forge_file("state.json", pickled()), "state.json"),
         Attack(
             "forged pickle as trained.safetensors", forge_file("trained.safetensors", pickled()), "trained"

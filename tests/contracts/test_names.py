@@ -15,27 +15,7 @@ INTERFACES = {
     "update": "one update of the policy by an update rule",
 }
 # Left to rename. Take a name out when it is gone; never add one.
-LEFT = {
-    "ACTIVATIONS",
-    "Array",
-    "Inputs",
-    "OPTIONS",
-    "Overdue",
-    "Parts",
-    "Result",
-    "Row",
-    "Settings",
-    "Step",
-    "TOLERANCE",
-    "WINDOWS",
-    "Worker",
-    "describe",
-    "pack",
-    "present_memory",
-    "quiet",
-    "to_batch",
-    "where",
-}
+LEFT: set[str] = set()
 
 
 def defined(module: ast.Module) -> set[str]:

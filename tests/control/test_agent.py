@@ -269,7 +269,7 @@ def test_first_ratios_are_checked(monkeypatch):
 
     monkeypatch.setattr(agent.policy, "forward", shifted)
     before = parameters(agent).clone()
-    from tightrope.algorithms.optimise import SamplingMismatch
+    from tightrope.algorithms.descent import SamplingMismatch
 
     with pytest.raises(SamplingMismatch, match="dropout"):
         agent.learn(256)
@@ -281,7 +281,7 @@ def test_the_compiled_engine_is_checked_against_ppo(monkeypatch):
     make(engine="fused", notify=said.append).learn(256)
     assert any("largest difference" in line for line in said)
     broken = make(engine="fused")
-    monkeypatch.setattr(broken.engine.fused, "check_first_minibatch", lambda batch, settings: 0.01)
+    monkeypatch.setattr(broken.engine, "check_first_minibatch", lambda batch, settings: 0.01)
     with pytest.raises(RuntimeError, match="--engine torch"):
         broken.learn(256)
     assert CHECK_LIMIT <= 1e-4
@@ -295,7 +295,7 @@ def test_kl_penalty_adapts_and_is_saved(tmp_path):
 
 
 def test_reinforce_masks_unfinished_episodes_without_a_baseline():
-    from tightrope.control.rollout.advantages import finished
+    from tightrope.control.rollout.rollout import finished
 
     ended = np.array([[0, 1, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]], bool)
     whole = np.ones_like(ended)

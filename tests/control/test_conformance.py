@@ -14,7 +14,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from torch import nn
 
 import tightrope
-from tightrope.control.rollout.advantages import to_batch
+from tightrope.control.rollout.rollout import to_batch
 
 GAMMA, LAMBDA, COLUMNS = 0.9375, 0.875, 40
 

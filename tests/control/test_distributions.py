@@ -50,7 +50,7 @@ def test_gsde_noise_has_the_deviation_that_its_density_claims():
     rows = 20_000
     inputs = {"flat": torch.tensor([[0.3, -0.8, 0.5]]).expand(rows, 3).contiguous()}
     policy.hold_exploration(rows, rng)
-    actions, logp = policy.act(inputs, torch.zeros(rows, 1))
+    actions, logp = policy.act({"flat": inputs["flat"].numpy()}, np.zeros((rows, 1), np.float32))
     distribution, _ = policy.evaluate(inputs)
     claimed = float(distribution.log_std[0].exp())
     assert float(actions.std()) == pytest.approx(claimed, rel=0.02)
@@ -65,14 +65,16 @@ def test_gsde_noise_has_the_deviation_that_its_density_claims():
 
 def test_gsde_holds_its_noise_and_predict_leaves_it_alone():
     policy, rng = make_policy(std="gsde"), np.random.default_rng(0)
-    inputs = {"flat": torch.rand(4, 3)}
+    inputs = {"flat": np.random.default_rng(1).random((4, 3), np.float32)}
     policy.hold_exploration(4, rng)
-    first, _ = policy.act(inputs, torch.zeros(4, 1))
-    policy.sample({"flat": torch.rand(2, 3)}, torch.zeros(2, 1), np.random.default_rng(5))
-    again, _ = policy.act(inputs, torch.ones(4, 1))
+    first, _ = policy.act(inputs, np.zeros((4, 1), np.float32))
+    policy.sample(
+        {"flat": np.ones((2, 3), np.float32)}, np.zeros((2, 1), np.float32), np.random.default_rng(5)
+    )
+    again, _ = policy.act(inputs, np.ones((4, 1), np.float32))
     assert torch.equal(first, again)
     policy.hold_exploration(4, rng)
-    assert not torch.equal(first, policy.act(inputs, torch.zeros(4, 1))[0])
+    assert not torch.equal(first, policy.act(inputs, np.zeros((4, 1), np.float32))[0])
 
 
 @torch.no_grad()
@@ -91,7 +93,7 @@ def test_masked_categories_are_never_sampled_and_weigh_nothing():
     distribution = Distribution(layout, torch.zeros(5000, 5), None, mask)
     noise = torch.rand(5000, 2)
     noise[0] = 1.0 - 1e-8  # rounding at the edge of the distribution
-    actions = distribution.sample(noise)
+    actions, _ = distribution.sample(noise)
     assert set(actions[:, 0].tolist()) == {0.0, 2.0}
     assert set(actions[:, 1].tolist()) == {1.0}
     assert float(distribution.entropy()[0]) == pytest.approx(math.log(2), abs=1e-6)
@@ -103,7 +105,7 @@ def test_frequencies_follow_the_probabilities():
     logits = torch.log(torch.tensor([[0.2, 0.5, 0.3, 0.0]]))
     logits[0, 3] = math.log(0.7 / 0.3)
     distribution = Distribution(layout, logits.expand(40_000, 4))
-    actions = distribution.sample(torch.rand(40_000, 2, generator=torch.Generator().manual_seed(0)))
+    actions, _ = distribution.sample(torch.rand(40_000, 2, generator=torch.Generator().manual_seed(0)))
     shares = [float((actions[:, 0] == k).float().mean()) for k in range(3)]
     assert shares == pytest.approx([0.2, 0.5, 0.3], abs=0.01)
     assert float(actions[:, 1].mean()) == pytest.approx(0.7, abs=0.01)

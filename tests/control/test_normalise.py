@@ -9,7 +9,7 @@ from torch import nn
 
 import tightrope
 from tightrope.control.policy.normalise import ObservationNormaliser, RewardNormaliser
-from tightrope.control.rollout.advantages import critic_values
+from tightrope.control.rollout.rollout import critic_values
 
 
 def test_reward_scale_by_hand_and_restarts_at_both_kinds_of_end():

@@ -275,15 +275,15 @@ def test_what_a_state_may_hold():
         "f": np.float32(0.1), "m": np.arange(6, dtype=np.int16).reshape(2, 3), "big": 2**100,
         "rng": np.random.default_rng(1).bit_generator.state, "mt": np.random.RandomState(1).get_state(False),
     }  # fmt: skip
-    again = states.unpack(json.loads(json.dumps(states.pack(value), allow_nan=False)))
+    again = states.decode(json.loads(json.dumps(states.encode(value), allow_nan=False)))
     np.testing.assert_equal(again, value)
     assert again["m"].dtype == np.int16 and type(again["f"]) is np.float32
     for wrong in (object(), {1: 2}, np.array([object()]), {"deep": [lambda: 0]}):
         with pytest.raises(TypeError, match="no file can hold without pickling"):
-            states.pack(wrong)
+            states.encode(wrong)
     for forged in ({"array": ["O", [1], ""]}, {"number": 3}, {"call": "os.system"}):
         with pytest.raises(ValueError, match="does not read"):
-            states.unpack(forged)
+            states.decode(forged)
 
 
 def test_a_wrapper_with_a_state_of_its_own_hides_the_one_inside():
@@ -312,7 +312,7 @@ def test_a_state_of_other_shapes_is_refused(tmp_path):
     folder, tensors, state = Run.open(run).newest()
     short, ints = np.zeros(1), np.zeros(4, np.float32)
     for name, wrong in {"_returns": short, "_lengths": ints, "_inputs": {"flat": ints[:, None]}}.items():
-        episodes = {**state["episodes"], name: states.pack(wrong)}
+        episodes = {**state["episodes"], name: states.encode(wrong)}
         checkpoint.save(folder, tensors, {**state, "episodes": episodes})
         with pytest.raises(
             checkpoint.CheckpointError, match=f"{name[1:]} of the episodes have another shape"

@@ -11,7 +11,7 @@ from gymnasium import spaces
 import tightrope
 from tightrope.cli.main import main
 from tightrope.control.environments.faults import EnvironmentFault
-from tightrope.control.rollout.rollout import BadNumbers
+from tightrope.control.rollout.collector import BadNumbers
 
 SMALL = dict(num_envs=2, num_steps=16, minibatch_size=16, num_epochs=1, seed=0)
 

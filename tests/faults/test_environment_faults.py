@@ -25,7 +25,7 @@ from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy,
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.processes import STEP
 from tightrope.control.resolve import resolve
-from tightrope.control.rollout.rollout import BadNumbers
+from tightrope.control.rollout.collector import BadNumbers
 from tightrope.control.train import resume, train
 from tightrope.runs.checkpoint import step_of
 
@@ -215,7 +215,7 @@ def test_death_is_survived_to_the_same_bits_each_time(agent_on):
 
 @pytest.mark.parametrize(("how", "rows"), [("raise", [3]), ("exit", [2, 3])])
 def test_the_failed_step_does_not_count_and_the_one_before_is_bootstrapped(how, rows, agent_on):
-    from tightrope.control.rollout.advantages import to_batch
+    from tightrope.control.rollout.rollout import to_batch
 
     plain = {"normalise_observations": False, "normalise_rewards": False}
     agent = agent_on(how, on_env_fault="restart", length=12, **plain)
@@ -339,7 +339,7 @@ class Keeper(Frail):
         (
             "hang get",
             "serial",
-            r"the state of environment 3 .* cannot be kept: Overdue: not back after 0.5 s",
+            r"the state of environment 3 .* cannot be kept: EnvironmentTimeout: not back after 0.5 s",
         ),
     ],
 )

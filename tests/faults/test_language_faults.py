@@ -103,9 +103,9 @@ def test_a_bad_number_is_named_before_the_step(folder, site, words, bad, monkeyp
         whole = module.rewards_of
 
         def poisoned(experience, *arguments):
-            rewards, scale = whole(experience, *arguments)
-            rewards[2, 0] = bad
-            return rewards, scale
+            found = whole(experience, *arguments)
+            found.rewards[2, 0] = bad
+            return found
 
         monkeypatch.setattr(module, "rewards_of", poisoned)
         made.settings = made.settings.with_values(normalise_advantages=False)

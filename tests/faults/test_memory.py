@@ -98,7 +98,7 @@ def test_a_single_row_that_does_not_fit_ends_with_advice():
 
 
 def test_supervised_steps_are_halved_likewise():
-    from tightrope.algorithms.optimise import StepGuard
+    from tightrope.algorithms.descent import CheckedSteps
     from tightrope.language.settings import SFTSettings
     from tightrope.language.supervised.fit import Objective, take_step
 
@@ -115,7 +115,7 @@ def test_supervised_steps_are_halved_likewise():
 
         objective = Objective("sft", "sft", [], loss, lambda item: 1, lambda item: int(item), dict)
         optimiser = torch.optim.SGD([weight], lr=1.0)
-        guard, items = StepGuard(torch.device("cpu")), [1.0, 2.0, 3.0, 4.0, 5.0]
+        guard, items = CheckedSteps(torch.device("cpu")), [1.0, 2.0, 3.0, 4.0, 5.0]
         metrics = take_step(objective, items, optimiser, guard, SFTSettings())
         assert metrics["sft/figure"] == 1.0
         results.append(weight.detach())

@@ -74,18 +74,18 @@ def test_without_a_checkpoint_it_ends_and_says_so(monkeypatch, tmp_path):
 def test_language_goes_back_goes_on_and_counts(monkeypatch, tmp_path):
     from tightrope.language.alignment import iteration as module
 
-    model, whole, calls, texts = saved(tmp_path / "model"), module.to_batch, [0], []
+    model, whole, calls, texts = saved(tmp_path / "model"), module.batch_of, [0], []
 
     def poisoned(experience, *arguments):
         batch = whole(experience, *arguments)
         calls[0] += 1
         if calls[0] in (3, 4):
-            texts.append(experience.ids())
+            texts.append(experience.ids)
         if calls[0] == 3:
             batch.advantages[0, 0] = torch.nan
         return batch
 
-    monkeypatch.setattr(module, "to_batch", poisoned)
+    monkeypatch.setattr(module, "batch_of", poisoned)
     lines = []
     run = align(
         model=model, prompts=["ab", "cd"], reward="length", run_dir=tmp_path / "run", total_episodes=32,

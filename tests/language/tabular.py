@@ -98,8 +98,7 @@ def advantages_of(
 ) -> tuple[Tensor, Tensor]:
     """GAE and the critic's targets of responses that end with their last counting step, [B, T] each."""
     ended = mask & ~torch.cat([mask[:, 1:], torch.zeros_like(mask[:, :1])], dim=1)
-    zeros = torch.zeros_like(rewards)
-    following = returns.next_values(values, zeros[:, 0], ended, zeros)
+    following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], dim=1)
     advantages = returns.gae(rewards, values, following, ended, ended, gamma, gae_lambda, mask)
     return advantages, advantages + values
 

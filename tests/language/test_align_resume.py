@@ -187,7 +187,7 @@ def test_other_prompts_and_less_than_was_done_are_refused(tmp_path, values, whol
     assert ((run / "summary.json").read_bytes(), (run / "settings.json").read_bytes()) == before
     told = []
     again = resume_align(run, **GIVEN, listeners=[lambda event: told.append(str(event))])
-    assert any("--total-episodes N goes on" in text for text in told)
+    assert any("--total-episodes N continues" in text for text in told)
     assert again.summary["final"] == whole.summary["final"] and again.summary["wall_seconds"] > 0
 
 

@@ -12,8 +12,8 @@ import torch
 from language.test_roles import PROMPTS, fresh, settings, shake
 from language.tiny import saved, tiny_llama
 
-from tightrope.language.alignment.experience import comparable, gather, kl_share, rewards_of, to_batch
-from tightrope.language.alignment.figures import describe
+from tightrope.language.alignment.experience import batch_of, gather, has_baseline, rewards_of
+from tightrope.language.alignment.figures import rollout_metrics
 from tightrope.language.alignment.iteration import PolicyModel
 from tightrope.language.reward.functions import Scores
 
@@ -51,8 +51,8 @@ SCORES = scores_of(*np.linspace(-1, 2, 6))
 def test_a_value_is_the_critics_of_the_text_before_the_token(folder, critic, layers):
     """Each response alone and unpadded; temperature is the policy's and changes no value."""
     roles, experience = experienced(settings(folder, critic=critic, lora_layers=layers, temperature=0.5))
-    rewards, _ = rewards_of(experience, SCORES, roles.settings, 0.05)
-    batch = to_batch(experience, rewards, EVERY, roles.settings)
+    rewards = rewards_of(experience, SCORES, roles.settings, 0.05).rewards
+    batch = batch_of(experience, rewards, EVERY, roles.settings)
     with torch.no_grad():
         trained = PolicyModel(roles)(batch).values
     for row in range(6):
@@ -71,8 +71,8 @@ def test_a_value_is_the_critics_of_the_text_before_the_token(folder, critic, lay
 def test_responses_of_different_lengths_have_their_score_at_their_own_end(folder):
     """Rewards by hand, advantages as brute-force sums, with a critic that says something."""
     roles, experience = experienced(settings(folder))
-    rewards, _ = rewards_of(experience, SCORES, roles.settings, 0.05)
-    batch = to_batch(experience, rewards, EVERY, roles.settings)
+    rewards = rewards_of(experience, SCORES, roles.settings, 0.05).rewards
+    batch = batch_of(experience, rewards, EVERY, roles.settings)
     lengths = experience.responses.mask.sum(1).tolist()
     assert len(set(lengths)) > 2 and max(lengths) == 10
     for row, length in enumerate(lengths):
@@ -113,12 +113,12 @@ def test_nan_behind_a_response_reaches_no_reward_advantage_or_metric(folder, val
     assert not clean.responses.mask.all()
     found = []
     for experience in (clean, poisoned(clean)):
-        rewards, scale = rewards_of(experience, SCORES, roles.settings, 0.05)
-        batch = to_batch(experience, rewards, EVERY, roles.settings)
+        given = rewards_of(experience, SCORES, roles.settings, 0.05)
+        rewards, scale, share = given.rewards, given.scale, given.kl_share
+        batch = batch_of(experience, rewards, EVERY, roles.settings)
         numbers = (rewards, batch.advantages, batch.returns)
         found.append([scale, *(x[batch.mask] for x in numbers)])
-        share = kl_share(experience, roles.settings, 0.05)
-        found[-1] += describe(experience, SCORES, rewards, share, EVERY).values()
+        found[-1] += rollout_metrics(experience, SCORES, rewards, share, EVERY).values()
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
 
@@ -133,8 +133,8 @@ def test_a_response_that_ended_is_terminal_where_cut_ones_are_bootstrapped(folde
         experience = gather(roles, PROMPTS, 1, 0, 2)
         responses = dataclasses.replace(experience.responses, ended=ended)
         experience = dataclasses.replace(experience, responses=responses)
-        batch = to_batch(experience, torch.zeros(6, 10), EVERY, present)
-        last = batch.advantages[torch.arange(6), experience.last]
+        batch = batch_of(experience, torch.zeros(6, 10), EVERY, present)
+        last = batch.advantages[torch.arange(6), experience.responses.mask.sum(1) - 1]
         torch.testing.assert_close(last, torch.where(ended, -0.7, cut))
 
 
@@ -143,10 +143,10 @@ def test_tokens_of_which_the_policy_is_certain_count(folder):
     roles, experience = experienced(settings(folder, top_k=1))
     mask = experience.responses.mask
     assert (experience.responses.logp[mask] == 0).all() and (experience.logp[mask] == 0).all()
-    rewards, _ = rewards_of(experience, SCORES, roles.settings, 0.0)
-    assert torch.equal(to_batch(experience, rewards, EVERY, roles.settings).mask, mask)
+    rewards = rewards_of(experience, SCORES, roles.settings, 0.0).rewards
+    assert torch.equal(batch_of(experience, rewards, EVERY, roles.settings).mask, mask)
     torch.testing.assert_close(rewards.sum(1), torch.from_numpy(SCORES.total).float())
-    assert [len(ids) for ids in experience.ids()] == mask.sum(1).tolist()
+    assert [len(ids) for ids in experience.ids] == mask.sum(1).tolist()
 
 
 def test_every_stop_of_the_generation_settings_ends_a_response_and_pays_no_penalty(folder):
@@ -154,22 +154,27 @@ def test_every_stop_of_the_generation_settings_ends_a_response_and_pays_no_penal
     roles, experience = experienced(settings(folder, missing_eos_penalty=1.5, max_new_tokens=3))
     assert roles.eos == STOPS
     responses, rows = experience.responses, torch.arange(6)
-    last = responses.tokens[rows, experience.last]
+    last = responses.tokens[rows, experience.responses.mask.sum(1) - 1]
     assert torch.equal(responses.ended, torch.isin(last, torch.tensor(STOPS)))
     assert responses.ended.any() and not responses.ended.all() and (last[responses.ended] != 3).any()
-    rewards, _ = rewards_of(experience, SCORES, roles.settings, 0.0)
+    rewards = rewards_of(experience, SCORES, roles.settings, 0.0).rewards
     wanted = torch.from_numpy(SCORES.total).float() - 1.5 * ~responses.ended
-    torch.testing.assert_close(rewards, torch.zeros(6, 3).index_put((rows, experience.last), wanted))
+    places = (rows, responses.mask.sum(1) - 1)
+    torch.testing.assert_close(rewards, torch.zeros(6, 3).index_put(places, wanted))
 
 
 def test_whitened_rewards_are_divided_by_the_deviation_of_what_counts_and_keep_their_mean(folder):
     _, experience = experienced(settings(folder))
     mask, scores = experience.responses.mask, scores_of(1, 2, math.nan, 4, -1, 3)
     experience.ref_logp[2] -= 50.0  # a response that does not count has no say in the scale
-    plain, one = rewards_of(experience, scores, settings(folder), 0.5)
-    found, scale = rewards_of(experience, scores, settings(folder, whiten_rewards=True), 0.5)
+    usual = rewards_of(experience, scores, settings(folder), 0.5)
+    whitened = rewards_of(experience, scores, settings(folder, whiten_rewards=True), 0.5)
+    plain, found, scale = usual.rewards, whitened.rewards, whitened.scale
+    assert torch.equal(usual.kl_share, whitened.kl_share)
     counting = mask & torch.from_numpy(scores.valid)[:, None]
-    assert one == 1.0 and scale == pytest.approx(1 / float(plain[counting].std(correction=0)), rel=1e-4)
+    assert usual.scale == 1.0 and scale == pytest.approx(
+        1 / float(plain[counting].std(correction=0)), rel=1e-4
+    )
     torch.testing.assert_close(found, plain * scale)
     assert abs(float(found[counting].mean())) > 0.01
 
@@ -190,11 +195,13 @@ def test_every_metric_of_a_rollout_by_hand():
         responses=responses, logp=logp, ref_logp=ref_logp, seconds=2.0,
         entropy=torch.tensor([[0.4, 0.6, nan], [7.0, 7.0, 7.0], [0.5, nan, nan]]),
         exact=torch.tensor([[0.1, 0.2, nan], [7.0, 7.0, 7.0], [0.6, nan, nan]]),
-        ids=lambda: [[5, 6], [5, 6, 5], [7]],
+        ids=[[5, 6], [5, 6, 5], [7]],
     )  # fmt: skip
     rewards = torch.tensor([[-0.1, 1.0, 0.0], [5.0, 5.0, 5.0], [0.5, 0.0, 0.0]])
     share = torch.tensor([[-0.1, -0.2, nan], [5.0, 5.0, 5.0], [0.1, nan, nan]])
-    found = describe(experience, scores_of(1.0, nan, 0.5), rewards, share, torch.tensor([True, False, True]))
+    found = rollout_metrics(
+        experience, scores_of(1.0, nan, 0.5), rewards, share, torch.tensor([True, False, True])
+    )
     k1 = [0.5, -1.0, -8.0, -8.0, -8.0, -0.25]  # log p - log p_ref, negative ones too
     wanted = {
         "objective/kl": sum(k1) / 3,
@@ -226,9 +233,9 @@ def test_without_a_signal_nothing_is_learnt_from_rounding(folder):
     roles = fresh(settings(folder))
     experience = gather(roles, PROMPTS, 1, 0, 2)
     assert not torch.equal(experience.responses.logp, experience.logp)
-    rewards, _ = rewards_of(experience, scores_of(*[0.0] * 6), roles.settings, 0.05)
+    rewards = rewards_of(experience, scores_of(*[0.0] * 6), roles.settings, 0.05).rewards
     assert not rewards.any()
-    assert not to_batch(experience, rewards, EVERY, roles.settings).advantages.any()
+    assert not batch_of(experience, rewards, EVERY, roles.settings).advantages.any()
 
 
 def test_the_share_of_the_kl_has_nothing_of_the_score(folder):
@@ -236,8 +243,8 @@ def test_the_share_of_the_kl_has_nothing_of_the_score(folder):
     experience.ref_logp -= 0.5
     for values in ({"reward_scale": 2.0}, {"reward_clip": 1.0}, {"missing_eos_penalty": 3.0}, {}):
         present = settings(folder, **values)
-        rewards, _ = rewards_of(experience, SCORES, present, 0.1)
-        found = describe(experience, SCORES, rewards, kl_share(experience, present, 0.1), EVERY)
+        given = rewards_of(experience, SCORES, present, 0.1)
+        found = rollout_metrics(experience, SCORES, given.rewards, given.kl_share, EVERY)
         assert found["objective/non_score_reward"] == pytest.approx(-0.1 * found["objective/kl"], rel=1e-5)
 
 
@@ -246,8 +253,8 @@ def test_where_no_response_counts_the_kl_is_known_and_the_score_is_not(folder):
     _, experience = experienced(settings(folder))
     experience.ref_logp -= 1.0
     nothing = torch.zeros(6, 10)
-    some = describe(experience, scores_of(*range(6)), nothing, nothing, EVERY)
-    none = describe(experience, scores_of(*[math.nan] * 6), nothing, nothing, ~EVERY)
+    some = rollout_metrics(experience, scores_of(*range(6)), nothing, nothing, EVERY)
+    none = rollout_metrics(experience, scores_of(*[math.nan] * 6), nothing, nothing, ~EVERY)
     assert none["objective/kl"] == some["objective/kl"] > 1
     assert math.isnan(none["objective/scores"]) and math.isnan(none["objective/rlhf_reward"])
 
@@ -255,7 +262,7 @@ def test_where_no_response_counts_the_kl_is_known_and_the_score_is_not(folder):
 def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(folder):
     """The log-probabilities trained against come from the pass that trains, not from the KV cache."""
     roles, experience = experienced(settings(folder, dtype="bfloat16"))
-    batch = to_batch(experience, torch.zeros(6, 10), EVERY, roles.settings)
+    batch = batch_of(experience, torch.zeros(6, 10), EVERY, roles.settings)
     with torch.no_grad():
         now = PolicyModel(roles)(batch).logp
     trained = (now - batch.old_logp)[batch.mask].abs().max()
@@ -265,5 +272,5 @@ def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(fol
 
 def test_a_response_without_a_sibling_that_counts_is_compared_with_nobody():
     valid = np.array([True, False, False, True, True, True, True, False, False])
-    assert comparable(valid, 3).tolist() == [False] * 3 + [True] * 3 + [False] * 3
-    assert comparable(np.array([True, True, False]), 3).tolist() == [True, True, False]
+    assert has_baseline(valid, 3).tolist() == [False] * 3 + [True] * 3 + [False] * 3
+    assert has_baseline(np.array([True, True, False]), 3).tolist() == [True, True, False]

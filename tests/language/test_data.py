@@ -16,7 +16,7 @@ from tightrope.language.data.batching import (
     Example,
     attention_of,
     collate,
-    pack,
+    pack_rows,
     pad_left,
     pad_right,
     row_of,
@@ -481,7 +481,7 @@ def random_examples(count: int, longest: int, seed: int = 0) -> list[Example]:
 
 def test_packing_keeps_every_example_once_and_wastes_little():
     given = random_examples(200, 30)
-    rows = pack(given, 32)
+    rows = pack_rows(given, 32)
     assert all(len(row) <= 32 for row in rows)
     found = []
     for row in rows:
@@ -494,10 +494,10 @@ def test_packing_keeps_every_example_once_and_wastes_little():
     assert sorted(found, key=key) == sorted(given, key=key)
     total = sum(len(example.tokens) for example in given)
     assert len(rows) <= 1.1 * total / 32 + 1
-    again = pack(given, 32)
+    again = pack_rows(given, 32)
     assert all(torch.equal(a.tokens, b.tokens) for a, b in zip(rows, again, strict=True))
     with pytest.raises(ValueError, match=r"examples\[0\] has 3 tokens; rows have 2"):
-        pack([Example((1, 2, 3), (False, True, True))], 2)
+        pack_rows([Example((1, 2, 3), (False, True, True))], 2)
 
 
 def test_rows_are_put_together_with_padding_that_is_no_text():

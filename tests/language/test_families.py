@@ -6,7 +6,7 @@ import pytest
 import torch
 from language.tiny import VOCABULARY, padded, saved
 
-from tightrope.algorithms.optimise import SamplingMismatch
+from tightrope.algorithms.descent import SamplingMismatch
 from tightrope.language import selfcheck
 from tightrope.language.alignment.figures import refuse_mismatch
 from tightrope.language.data.batching import Example, collate, row_of
@@ -186,17 +186,17 @@ def test_a_reward_model_without_fused_attention_loads(tmp_path):
 
 @pytest.mark.parametrize(("dtype", "limit"), [("float32", LOG_RATIO_LIMIT), ("bfloat16", LOWERED_LIMIT)])
 def test_sampling_and_training_may_differ_by_rounding_alone_in_every_precision(dtype, limit):
-    refuse_mismatch(limit, dtype, first=True)
+    refuse_mismatch(limit, limit, dtype, first=True)
     for gap in (limit * 1.01, float("nan")):
         with pytest.raises(SamplingMismatch, match=r"KV cache.*window"):
-            refuse_mismatch(gap, dtype, first=True)
+            refuse_mismatch(gap, limit, dtype, first=True)
     if dtype == "float32":
         with pytest.raises(SamplingMismatch):
-            refuse_mismatch(limit * 1.01, dtype, first=False)
+            refuse_mismatch(limit * 1.01, limit, dtype, first=False)
     else:
-        refuse_mismatch(limit * 1.01, dtype, first=False)  # one token of many, late in a run
+        refuse_mismatch(limit * 1.01, limit, dtype, first=False)  # one token of many, late in a run
     with pytest.raises(SamplingMismatch):
-        refuse_mismatch(float("nan"), dtype, first=False)
+        refuse_mismatch(float("nan"), limit, dtype, first=False)
 
 
 def test_sampling_from_a_scaled_model_is_not_from_its_head(tmp_path):

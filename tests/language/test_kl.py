@@ -14,20 +14,15 @@ from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.language.alignment.kl import (
-    BIASED_KL_FORMS,
     KL_FORMS,
-    AdaptiveKL,
-    bias_of,
+    adapted,
     kl_loss,
     kl_rewards,
-    kl_steps,
-    needs_exact,
     shared_scale,
 )
 from tightrope.language.settings import AlignSettings
 from tightrope.maths import returns, statistics, surrogate
 
-ALL_FORMS = (*KL_FORMS, *BIASED_KL_FORMS)
 EXACT = dict(rtol=0, atol=1e-10)
 KL_BETA = 0.3
 
@@ -134,48 +129,15 @@ def test_loss_forms_have_the_gradient_of_the_states_own_kl(form: str) -> None:
     assert off_by(found, world.right) > 0.05, "later states are not seen, so it cannot be the whole gradient"
 
 
-def test_what_the_biased_forms_really_do() -> None:
-    """Each sentence of BIASED_KL_FORMS as an equation."""
-    world = World(2)
-    values = world.some_values()
-    whole = (world.of_scores - world.right) / KL_BETA  # the gradient of the KL of responses
-
-    def kl_gradient(form: str) -> Tensor:
-        return (world.of_scores - world.expected(form, world.scores, values)) / KL_BETA
-
-    torch.testing.assert_close(kl_gradient("k1-loss"), torch.zeros_like(whole), **EXACT)
-    torch.testing.assert_close(kl_gradient("k3-loss"), world.per_state(forward=True), **EXACT)
-    torch.testing.assert_close(kl_gradient("exact-reward"), whole - world.per_state(), **EXACT)
-    torch.testing.assert_close(kl_gradient("k3-reward"), whole - world.per_state(forward=True), **EXACT)
-    for form in BIASED_KL_FORMS:
-        assert off_by(kl_gradient(form), whole) > 0.2, form
-
-
 def test_one_state_alone() -> None:
-    """Responses of one token: all sound forms agree with autograd, no biased one comes near."""
+    """Responses of one token: all forms agree with autograd."""
     world = World(3, words=5, length=1)
     for form in KL_FORMS:
         found = world.expected(form, world.scores, world.some_values())
         torch.testing.assert_close(found, world.right, **EXACT)
-    whole = world.of_scores - world.right
-    for form in BIASED_KL_FORMS:
-        found = world.of_scores - world.expected(form, world.scores, world.some_values())
-        assert off_by(found, whole) > 0.2, form
 
 
-def test_near_the_reference_k2_and_k3_as_rewards_hold_nothing() -> None:
-    """There the KL is of second order, its gradient of first, and theirs of second."""
-    world = World(4, words=5, length=1)
-    with torch.no_grad():
-        world.policy.logits.copy_(world.reference.logits + 0.01 * world.policy.logits)
-    nothing = torch.zeros_like(world.scores)
-    whole = world.expected("k1-reward", nothing, world.some_values())
-    torch.testing.assert_close(whole, -KL_BETA * world.per_state(), **EXACT)
-    for form in ("k2-reward", "k3-reward"):
-        assert float(world.expected(form, nothing, world.some_values()).norm() / whole.norm()) < 0.05
-
-
-@pytest.mark.parametrize("form", ["k2-loss", "exact-loss", "k3-loss", "k1-loss"])
+@pytest.mark.parametrize("form", ["k2-loss", "exact-loss"])
 def test_weights_make_up_for_actions_of_an_older_policy(form: str) -> None:
     """Responses are the old policy's; over the states it reached, the gradient is the present policy's."""
     world, old = World(5), Tabular(Language(3, 3), seed=50)
@@ -186,15 +148,17 @@ def test_weights_make_up_for_actions_of_an_older_policy(form: str) -> None:
     log_ratio = logp - old.logp(tokens)
 
     def gradient(weights: Tensor | None) -> Tensor:
-        steps = kl_steps(form, logp, ref_logp, exact, mask, weights)
-        assert steps is not None
-        total = (visits[:, None] * steps).sum()
+        total = torch.zeros((), dtype=torch.float64)
+        for row, often in enumerate(visits):  # a response as a minibatch of its own, with the count 1
+            here = slice(row, row + 1)
+            ratio = None if weights is None else weights[here]
+            loss = kl_loss(form, logp[here], ref_logp[here], exact[here], mask[here], 1, ratio)
+            assert loss is not None
+            total = total + often * loss
         (found,) = torch.autograd.grad(total, world.policy.logits, retain_graph=True)
         return found
 
-    right = world.per_state(visits=visits, forward=form == "k3-loss")
-    if form == "k1-loss":
-        right = torch.zeros_like(right)
+    right = world.per_state(visits=visits)
     torch.testing.assert_close(gradient(log_ratio), right, **EXACT)
     assert torch.equal(gradient(None), gradient(log_ratio)) == (form == "exact-loss")
 
@@ -292,9 +256,6 @@ KL, MASK = torch.tensor([[0.1, 0.2, 0.0]]), torch.tensor([[True, True, False]])
     ("form", "first", "second"),
     [
         ("k1-reward", 0.5, -1.0),
-        ("k2-reward", 0.125, 0.5),
-        ("k3-reward", math.exp(-0.5) - 1 + 0.5, math.exp(1) - 1 - 1),
-        ("exact-reward", 0.1, 0.2),
         ("exact-split", 0.2, 0.0),  # step 0 leads to the state of step 1; step 1 to the end
         ("k2-loss", 0.0, 0.0),
         ("exact-loss", 0.0, 0.0),
@@ -317,24 +278,21 @@ def test_a_discount_acts_on_the_state_that_follows() -> None:
         ("k2-loss", 0.125, 0.5),
         ("exact-loss", 0.1, 0.2),
         ("exact-split", 0.1, 0.2),
-        ("k1-loss", 0.5, -1.0),
-        ("k3-loss", math.exp(-0.5) - 0.5, math.exp(1) - 2),
     ],
 )
 def test_losses_by_hand(form: str, first: float, second: float) -> None:
-    """The sum over the steps at hand over the count of all; `kl_steps` are its summands."""
+    """The sum over the steps at hand over the count of all."""
     assert float(kl_loss(form, LOGP, REF_LOGP, KL, MASK, 8)) == pytest.approx((first + second) / 8)
-    steps = kl_steps(form, LOGP, REF_LOGP, KL, MASK)
-    torch.testing.assert_close(steps, torch.tensor([[first, second, 0.0]]))
+    for step, wanted in enumerate((first, second)):
+        one = MASK & (torch.arange(3) == step)
+        assert float(kl_loss(form, LOGP, REF_LOGP, KL, one, 1)) == pytest.approx(wanted)
 
 
-@pytest.mark.parametrize("form", ["k1-reward", "k2-reward", "k3-reward", "exact-reward"])
-def test_reward_forms_have_no_loss(form: str) -> None:
-    assert kl_steps(form, LOGP, REF_LOGP, KL, MASK) is None
-    assert kl_loss(form, LOGP, REF_LOGP, KL, MASK, 2) is None
+def test_a_kl_in_the_reward_has_no_loss() -> None:
+    assert kl_loss("k1-reward", LOGP, REF_LOGP, KL, MASK, 2) is None
 
 
-@pytest.mark.parametrize("form", ALL_FORMS)
+@pytest.mark.parametrize("form", KL_FORMS)
 def test_nan_behind_the_mask_changes_nothing(form: str) -> None:
     def everything(*parts: Tensor) -> list[Tensor]:
         leaves = [part.clone().requires_grad_() for part in parts]
@@ -352,7 +310,7 @@ def test_nan_behind_the_mask_changes_nothing(form: str) -> None:
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("form", ALL_FORMS)
+@pytest.mark.parametrize("form", KL_FORMS)
 def test_what_is_given_stays_as_it_is(form: str) -> None:
     """The same tensors are reported as the KL: a weight multiplied in place would falsify the report."""
     given = [LOGP.clone(), REF_LOGP.clone(), KL.clone(), MASK.clone()]
@@ -364,10 +322,10 @@ def test_what_is_given_stays_as_it_is(form: str) -> None:
 
 @pytest.mark.parametrize("far", [-30.0, 30.0])
 def test_no_clamp_takes_the_pull_away_far_from_the_reference(far: float) -> None:
-    """By hand at a log-ratio of 30: k1 has slope 1, k2 the log-ratio, k3 1 - exp(-log-ratio)."""
+    """By hand at a log-ratio of 30: the exact KL has slope 1, k2 the log-ratio."""
     one = torch.ones(1, 1, dtype=torch.bool)
     ref_logp = torch.full((1, 1), -40.0, dtype=torch.float64)
-    slopes = {"k1-loss": 1.0, "k2-loss": far, "k3-loss": 1 - math.exp(-far), "exact-loss": 1.0}
+    slopes = {"k2-loss": far, "exact-loss": 1.0}
     for form, slope in slopes.items():
         logp = (ref_logp + far).requires_grad_()
         loss = kl_loss(form, logp, ref_logp, logp - ref_logp, one, 1)
@@ -376,39 +334,36 @@ def test_no_clamp_takes_the_pull_away_far_from_the_reference(far: float) -> None
     assert kl_rewards("k1-reward", 0.5, logp, ref_logp, None, one).item() == pytest.approx(-0.5 * far)
 
 
-@pytest.mark.parametrize("form", ["k1-loss", "k2-loss", "k3-loss"])
-def test_no_gradient_reaches_the_reference_or_the_weights(form: str) -> None:
+def test_no_gradient_reaches_the_reference_or_the_weights() -> None:
     logp, ref_logp, log_ratio = (x.clone().requires_grad_() for x in (LOGP, REF_LOGP, LOGP))
-    loss = kl_loss(form, logp, ref_logp, KL, MASK, 2, log_ratio)
+    loss = kl_loss("k2-loss", logp, ref_logp, KL, MASK, 2, log_ratio)
     found = torch.autograd.grad(loss, (logp, ref_logp, log_ratio), allow_unused=True)
     assert found[0] is not None and found[1] is None and found[2] is None
 
 
-def test_sound_forms_have_no_bias_and_the_others_say_theirs() -> None:
-    assert [bias_of(form) for form in KL_FORMS] == [None] * 4
-    for form in BIASED_KL_FORMS:
-        assert form.split("-")[0] in str(bias_of(form)) and form.split("-")[1] in str(bias_of(form))
-    assert {form for form in ALL_FORMS if needs_exact(form)} == {"exact-split", "exact-loss", "exact-reward"}
-
-
 def test_the_settings_offer_exactly_these_forms() -> None:
     fields = {field.name: field for field in dataclasses.fields(AlignSettings)}
-    assert set(fields["kl"].metadata["choices"]) == set(ALL_FORMS)
+    assert set(fields["kl"].metadata["choices"]) == set(KL_FORMS)
     assert fields["kl"].default in KL_FORMS
     for form in KL_FORMS:
         assert AlignSettings(kl=form).kl == form
-    for form in BIASED_KL_FORMS:
-        assert AlignSettings(kl=form, allow_biased_kl=True).kl == form
-        with pytest.raises(ValueError, match="allow-biased-kl"):
-            AlignSettings(kl=form)
+    with pytest.raises(ValueError, match="kl is 'k3-reward'; expected one of: k1-reward"):
+        AlignSettings(kl="k3-reward")
+
+
+def test_settings_of_older_runs_are_read() -> None:
+    """They hold allow_biased_kl, which is no setting any more."""
+    assert AlignSettings.from_json({"kl": "k2-loss", "allow_biased_kl": False}).kl == "k2-loss"
+    with pytest.raises(ValueError, match="no setting named 'allow_biased_kl'"):
+        AlignSettings().with_values(allow_biased_kl=True)
 
 
 def test_mistakes_are_named() -> None:
-    with pytest.raises(ValueError, match="kl is 'k4-reward'; expected k1-reward, exact-split"):
+    with pytest.raises(ValueError, match="kl is 'k4-reward'; expected one of k1-reward, exact-split"):
         kl_rewards("k4-reward", 0.1, LOGP, REF_LOGP, KL, MASK)
     with pytest.raises(ValueError, match="kl is 'k1'"):
         kl_loss("k1", LOGP, REF_LOGP, KL, MASK, 2)
-    for needs in ("exact-split", "exact-loss", "exact-reward"):
+    for needs in ("exact-split", "exact-loss"):
         with pytest.raises(ValueError, match="exact is None"):
             kl_rewards(needs, 0.1, LOGP, REF_LOGP, None, MASK)
     with pytest.raises(ValueError, match=r"shapes differ: logp \(1, 3\), ref_logp \(3,\)"):
@@ -421,37 +376,22 @@ def test_mistakes_are_named() -> None:
     assert kl_rewards("k1-reward", 0.0, LOGP, impossible, None, MASK).tolist() == [[0, 0, 0]]
 
 
-def test_the_controller_follows_zieglers_equation() -> None:
-    control = AdaptiveKL(0.2, target=6.0, horizon=10_000)
-    assert control.next(6.0, 512) == control
-    assert control.next(6.6, 500).kl_beta == pytest.approx(0.2 * (1 + 0.1 * 500 / 10_000))
-    assert control.next(5.4, 500).kl_beta == pytest.approx(0.2 * (1 - 0.1 * 500 / 10_000))
+def test_kl_beta_follows_zieglers_equation() -> None:
+    goal = {"target": 6.0, "horizon": 10_000}
+    assert adapted(0.2, 6.0, 512, **goal) == 0.2
+    assert adapted(0.2, 6.6, 500, **goal) == pytest.approx(0.2 * (1 + 0.1 * 500 / 10_000))
+    assert adapted(0.2, 5.4, 500, **goal) == pytest.approx(0.2 * (1 - 0.1 * 500 / 10_000))
     for extreme, sign in ((600.0, 1), (0.0, -1), (-3.0, -1)):
-        assert control.next(extreme, 500).kl_beta == pytest.approx(0.2 * (1 + sign * 0.2 * 500 / 10_000))
-
-
-def test_the_controller_is_its_fields() -> None:
-    """Saved and loaded in the middle it goes on as if it had not been."""
-    first = AdaptiveKL(0.2, 6.0).next(9.0, 64)
-    again = AdaptiveKL(**dataclasses.asdict(first))
-    assert again.next(2.0, 64) == first.next(2.0, 64) and first.kl_beta != 0.2
-
-
-def test_fed_with_the_mean_over_tokens_the_controller_would_only_fall() -> None:
-    """Why the sum over the response matters: 24 tokens at the target are a quarter of a nat per token."""
-    control, wrong = AdaptiveKL(0.2, 6.0), AdaptiveKL(0.2, 6.0)
-    for _ in range(67):
-        control, wrong = control.next(6.0, 512), wrong.next(6.0 / 24, 512)
-    assert control.kl_beta == 0.2
-    assert wrong.kl_beta == pytest.approx(0.1, rel=0.01)
-
-
-def test_the_controllers_mistakes_are_named() -> None:
-    with pytest.raises(ValueError, match=r"kl_beta is 0.0; .* needs a number above 0"):
-        AdaptiveKL(0.0, 6.0)
-    with pytest.raises(ValueError, match="target is nan"):
-        AdaptiveKL(0.1, math.nan)
+        assert adapted(0.2, extreme, 500, **goal) == pytest.approx(0.2 * (1 + sign * 0.2 * 500 / 10_000))
     with pytest.raises(ValueError, match="the KL is nan"):
-        AdaptiveKL(0.1, 6.0).next(math.nan, 64)
-    with pytest.raises(ValueError, match="Use a horizon above 200"):
-        AdaptiveKL(0.1, 6.0, horizon=100).next(7.0, 1000)
+        adapted(0.1, math.nan, 64, **goal)
+
+
+def test_with_the_mean_over_tokens_kl_beta_would_only_fall() -> None:
+    """Why the sum over the response matters: 24 tokens at the target are a quarter of a nat per token."""
+    right = wrong = 0.2
+    for _ in range(67):
+        right = adapted(right, 6.0, 512, target=6.0, horizon=10_000)
+        wrong = adapted(wrong, 6.0 / 24, 512, target=6.0, horizon=10_000)
+    assert right == 0.2
+    assert wrong == pytest.approx(0.1, rel=0.01)

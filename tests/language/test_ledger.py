@@ -16,9 +16,9 @@ from tightrope.language.memory import (
     Ledger,
     amount,
     available_memory,
-    check,
     job_of,
     ledger,
+    require_fit,
 )
 from tightrope.language.model import lora
 from tightrope.language.model.load import without_dropout
@@ -188,7 +188,7 @@ def test_jobs_come_from_the_settings_of_the_commands() -> None:
     assert job_of(SFTSettings(minibatch_size=4, micro_batch_size=8)).micro_batch_size == 4
     pairs = job_of(RewardSettings(micro_batch_size=2))
     assert (pairs.critic, pairs.rows_per_example, pairs.language_head) == ("head", 2, False)
-    with pytest.raises(ValueError, match="ModelSettings is no job"):
+    with pytest.raises(ValueError, match="ModelSettings is not a job"):
         job_of(ModelSettings())
 
 
@@ -213,7 +213,7 @@ def test_weights_that_are_trained_in_full_stay_float32_beside_their_lowered_copi
     lowered = entry(found, "model: copies of its weights in bfloat16")
     assert lowered == size_of(p for p in parts(model).layers.parameters() if p.dim() == 2) / 2
     with pytest.raises(DoesNotFit) as caught:
-        check(ledger(config, job_of(SFTSettings(tune="full"))), 1000)
+        require_fit(ledger(config, job_of(SFTSettings(tune="full"))), 1000)
     assert "--micro-batch-size" in str(caught.value) and "--dtype" not in str(caught.value)
 
 
@@ -225,24 +225,24 @@ def test_a_reward_model_does_not_train_the_language_head() -> None:
 def test_a_job_that_fits_passes_and_one_that_does_not_is_told_what_helps() -> None:
     job = dataclasses.replace(ALIGN, tune="full", critic="separate", micro_batch_size=16)
     found = ledger(LLAMA, job)
-    check(found, None)
-    check(found, int(found.total / 0.9) + 1)
+    require_fit(found, None)
+    require_fit(found, int(found.total / 0.9) + 1)
     with pytest.raises(DoesNotFit, match="This job needs about") as caught:
-        check(found, int(found.total / 0.9) - 1)
+        require_fit(found, int(found.total / 0.9) - 1)
     text = str(caught.value)
     for words in ("--micro-batch-size 4", "--tune lora", "--critic head", "--dtype bfloat16", "all of these"):
         assert f"  {words}: " in text
     lora_total = ledger(LLAMA, dataclasses.replace(job, tune="lora")).total
     assert f"--tune lora: {amount(lora_total)}, fits" in text
     with pytest.raises(DoesNotFit, match="all of these: .*, still too much"):
-        check(found, 1000)
+        require_fit(found, 1000)
     assert issubclass(DoesNotFit, ValueError)
 
 
 def test_advice_names_only_what_would_help() -> None:
     job = Job(dtype="bfloat16", gradient_checkpointing=True, prompt_tokens=8, language_head=False)
     with pytest.raises(DoesNotFit) as caught:
-        check(ledger(LLAMA, job), 1000)
+        require_fit(ledger(LLAMA, job), 1000)
     assert str(caught.value).endswith("What would help:\n  a smaller model")
 
 
@@ -325,7 +325,7 @@ def told(settings: AlignSettings, **given) -> tuple[Ledger, str]:
         raise Stop
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
-        patch.setattr(roles, "ledger", hold)
+        patch.setattr(memory, "ledger", hold)
         roles.make_roles(settings, None, stop, **given)
     return seen["ledger"], seen["text"]
 

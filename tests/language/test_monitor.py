@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.stats import linregress
 
-from tightrope.language.alignment.monitor import FEWEST_POINTS, WINDOWS, Monitor, fit, rising
+from tightrope.language.alignment.monitor import FEWEST_POINTS, TREND_WINDOWS, Monitor, fit, trend_p_value
 
 ALPHA, BETA, OFFSET = 1.0, 0.4, -0.3
 PEAK_KL = math.exp(ALPHA / BETA - 1) ** 2  # 20.1 nats
@@ -114,7 +114,7 @@ def test_many_points_at_one_kl_are_few_points():
 
 def test_kls_that_hardly_differ_are_said_to_be_too_near():
     found = fit([(kl, curve(kl)) for kl in np.linspace(10, 20, 12)])
-    assert found.reason == "the KLs reach from 10 to 20, too near to each other"
+    assert found.reason == "the KLs reach from 10 to 20, too close to each other"
 
 
 def test_points_that_are_not_finite_are_left_out_and_a_negative_kl_counts_as_zero():
@@ -197,7 +197,7 @@ def test_proxy_up_and_gold_down_is_over_optimisation():
         for alarm in monitor.add(kl, 0.1 * index, value):
             places[alarm.kind] = index
             assert "kl_beta" in alarm.text and not alarm.stop
-    assert 10 + WINDOWS[0] // 2 <= places["over-optimised"] <= 10 + WINDOWS[0]
+    assert 10 + TREND_WINDOWS[0] // 2 <= places["over-optimised"] <= 10 + TREND_WINDOWS[0]
 
 
 @pytest.mark.parametrize("direction", [-1.0, 0.0])
@@ -242,20 +242,17 @@ def test_updates_without_gold_or_proxy_are_no_points():
     for kl in range(10):
         monitor.add(float(kl), 1.0)
         monitor.add(float(kl), 1.0, math.nan)
-    assert monitor.fit.points == 0 and monitor.metrics() == {}
-    for kl in range(WINDOWS[-1]):
+    assert monitor.fit.points == 0 and not monitor.fit.decided
+    for kl in range(TREND_WINDOWS[-1]):
         assert all(alarm.kind != "over-optimised" for alarm in monitor.add(float(kl), math.nan, -1.0 * kl))
 
 
-def test_the_metric_is_the_fits_and_is_declared():
-    from tightrope.metrics.table import check_names
-
+def test_few_points_on_the_curve_decide_where_the_top_is():
     monitor = Monitor()
     for kl in (0.0, 2.0, 5.0, 9.0, 14.0):
         monitor.add(kl, kl, float(curve(kl)))
-    assert monitor.metrics() == {"objective/gold_predicted_peak_kl": monitor.fit.peak_kl}
+    assert monitor.fit.decided
     assert monitor.fit.peak_kl == pytest.approx(PEAK_KL, rel=1e-6)
-    check_names(monitor.metrics())
 
 
 @given(cut=st.integers(0, 30))
@@ -280,9 +277,9 @@ def test_rising_is_the_one_sided_test_of_regression(values):
     result = linregress(np.arange(len(values)), values)
     assume(abs(result.rvalue) < 1 - 1e-9)
     expected = result.pvalue / 2 if result.slope > 0 else 1 - result.pvalue / 2
-    assert rising(np.array(values)) == pytest.approx(expected, abs=1e-6)
+    assert trend_p_value(np.array(values)) == pytest.approx(expected, abs=1e-6)
 
 
 def test_rising_of_straight_lines():
     steps = np.arange(6.0)
-    assert (rising(steps), rising(-steps), rising(0 * steps)) == (0.0, 1.0, 1.0)
+    assert (trend_p_value(steps), trend_p_value(-steps), trend_p_value(0 * steps)) == (0.0, 1.0, 1.0)

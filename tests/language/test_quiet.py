@@ -8,7 +8,7 @@ import warnings
 import pytest
 from language.tiny import saved, tiny_llama
 
-from tightrope.language.quiet import quiet
+from tightrope.language.quiet import quiet_libraries
 
 PROGRAM = """
 from tightrope.language import align, sample_run
@@ -57,11 +57,11 @@ def from_library(module: str, category: type[Warning] = FutureWarning) -> None:
 def test_deprecations_of_libraries_are_hidden_unless_somebody_asked(module):
     with warnings.catch_warnings(record=True) as seen:
         warnings.resetwarnings()
-        with quiet():
+        with quiet_libraries():
             from_library(module)
         assert seen == []
         warnings.simplefilter("error")
-        with quiet(), pytest.raises(FutureWarning):
+        with quiet_libraries(), pytest.raises(FutureWarning):
             from_library(module)
 
 
@@ -71,7 +71,7 @@ def test_deprecations_of_libraries_are_hidden_unless_somebody_asked(module):
 def test_warnings_of_a_users_own_code_and_of_other_kinds_are_shown(module, category):
     with warnings.catch_warnings(record=True) as seen:
         warnings.resetwarnings()
-        with quiet():
+        with quiet_libraries():
             from_library(module, category)
     assert [str(x.message) for x in seen] == ["`old` is deprecated"]
 
@@ -84,7 +84,7 @@ def test_the_bars_of_the_hub_are_as_they_were(off):
     before = are_progress_bars_disabled()
     (disable_progress_bars if off else enable_progress_bars)()
     try:
-        with quiet():
+        with quiet_libraries():
             assert are_progress_bars_disabled()
         assert are_progress_bars_disabled() == off
     finally:
@@ -92,7 +92,7 @@ def test_the_bars_of_the_hub_are_as_they_were(off):
 
 
 def test_the_hubs_own_switch_brings_no_warning():
-    program = "from tightrope.language.quiet import quiet\nwith quiet():\n    pass\n"
+    program = "from tightrope.language.quiet import quiet_libraries\nwith quiet_libraries():\n    pass\n"
     environment = {**os.environ, "HF_HUB_DISABLE_PROGRESS_BARS": "0"}
     command = [sys.executable, "-c", program]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
@@ -106,7 +106,7 @@ def test_what_was_set_before_is_put_back_after_an_error_too(bars):
     before = logging.get_verbosity(), logging.is_progress_bar_enabled(), list(warnings.filters)
     (logging.enable_progress_bar if bars else logging.disable_progress_bar)()
     try:
-        with pytest.raises(KeyError), quiet():
+        with pytest.raises(KeyError), quiet_libraries():
             assert not logging.is_progress_bar_enabled()
             assert logging.get_verbosity() == logging.ERROR
             raise KeyError

@@ -10,7 +10,7 @@ import pytest
 import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
-from tightrope.algorithms.optimise import StepGuard
+from tightrope.algorithms.descent import CheckedSteps
 from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Pair, preference_pairs
 from tightrope.language.model import lora
@@ -22,12 +22,12 @@ from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised.fit import Objective, take_step
 from tightrope.language.supervised.preferences import (
     calibration,
-    differences,
     longest,
     make_head,
     normalise,
     pair_loss,
     right_order,
+    score_differences,
     train_reward,
 )
 from tightrope.runs.run import Run
@@ -123,21 +123,21 @@ def test_micro_batches_add_up_to_the_minibatch():
         model = scorer()
 
         def loss(items, model=model):
-            found = differences(model, items)
+            found = score_differences(model, items)
             return pair_loss(found), {"margin": found.detach().sum()}
 
         objective = Objective("reward", "train", pairs, loss, lambda pair: 1, longest, dict)
         parameters = [*model.base.parameters(), *model.head.parameters()]
         settings = settings_of(micro_batch_size=micro, max_grad_norm=None)
         optimiser = torch.optim.SGD(parameters, lr=0.1)
-        metrics = take_step(objective, pairs, optimiser, StepGuard(torch.device("cpu")), settings)
+        metrics = take_step(objective, pairs, optimiser, CheckedSteps(torch.device("cpu")), settings)
         found.append((metrics, [p.detach() for p in parameters]))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-4)
     for a, b in zip(found[0][1], found[1][1], strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
     fresh = scorer()
     with torch.no_grad():
-        by_hand = torch.cat([differences(fresh, [pair]) for pair in pairs])
+        by_hand = torch.cat([score_differences(fresh, [pair]) for pair in pairs])
     assert found[0][0]["reward/margin"] == pytest.approx(float(by_hand.mean()), rel=1e-4)
     assert found[0][0]["reward/loss"] == pytest.approx(float(pair_loss(by_hand)) / 9, rel=1e-4)
 
@@ -211,7 +211,7 @@ def test_it_learns_what_is_preferred_and_loads_elsewhere(tmp_path, make, tune):
     unseen = preferences(60, seed=9)
     pairs = preference_pairs(unseen, model.tokenizer, eos=EOS, max_tokens=32)
     with torch.no_grad():
-        assert float(right_order(differences(model, pairs)).mean()) > 0.85
+        assert float(right_order(score_differences(model, pairs)).mean()) > 0.85
     trained = texts_of(rows)  # the chosen ones; a fifth of them is held out
     scores = model.score(*pad_right(trained))
     assert float(scores.mean()) == pytest.approx(0.0, abs=0.1)
@@ -336,16 +336,16 @@ def test_same_seed_same_bits_other_seed_others(tmp_path, folder):
 
 
 def test_pairs_of_one_prompt_are_held_out_together(tmp_path, folder, monkeypatch):
-    from tightrope.language.supervised import preferences as reward_model
+    from tightrope.language.supervised import prepare
 
     seen = {}
-    whole = reward_model.hold_out
+    whole = prepare.hold_out
 
     def spy(*arguments):
         seen["own"], seen["held"] = whole(*arguments)
         return seen["own"], seen["held"]
 
-    monkeypatch.setattr(reward_model, "hold_out", spy)
+    monkeypatch.setattr(prepare, "hold_out", spy)
     rows = preferences(104)  # 26 prompts, four pairs each
     train_reward(settings_of(folder, num_epochs=1), data=rows, run_dir=tmp_path / "run")
     own, held = ({pair.chosen[: pair.prompt_length] for pair in seen[part]} for part in ("own", "held"))
@@ -355,7 +355,7 @@ def test_pairs_of_one_prompt_are_held_out_together(tmp_path, folder, monkeypatch
 def test_what_is_no_reward_model_is_named(tmp_path, folder):
     from transformers import LlamaConfig, LlamaForSequenceClassification
 
-    with pytest.raises(ValueError, match=r"absent is no reward model: it holds no config.json"):
+    with pytest.raises(ValueError, match=r"absent is not a reward model: it holds no config.json"):
         load_reward(tmp_path / "absent")
     with pytest.raises(ValueError, match="holds LlamaForCausalLM, which gives no scores"):
         load_reward(folder)

@@ -360,6 +360,18 @@ def test_a_coroutine_that_hangs_makes_only_itself_late():
     assert cancelled
 
 
+def test_scores_that_a_cancelled_coroutine_returns_are_not_used():
+    async def stubborn(completions):
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.sleep(60)
+        return [9.0] * len(completions)
+
+    rewards = Rewards([stubborn], timeout=SOON)
+    for _ in range(2):
+        found = rewards.score(PROMPTS, TEXTS, IDS)
+        assert [fault.kind for fault in found.faults] == ["timeout"] and not found.valid.any()
+
+
 def test_a_coroutine_that_blocks_its_loop_does_not_block_us():
     release = threading.Event()
 

@@ -9,7 +9,7 @@ from language.tiny import saved
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.optimise import make_optimiser
-from tightrope.language.alignment.experience import gather, rewards_of, to_batch
+from tightrope.language.alignment.experience import batch_of, gather, rewards_of
 from tightrope.language.data import batching
 from tightrope.language.data.batching import length_groups, used_columns
 from tightrope.language.data.examples import Prompt
@@ -37,8 +37,8 @@ def experienced(present):
     roles = make_roles(present, notify=lambda text: None)
     experience = gather(roles, PROMPTS, 1, 0, 2)
     scores = Scores(np.linspace(-1, 2, 6), np.ones(6, bool), {}, {}, {})
-    rewards, _ = rewards_of(experience, scores, present, present.kl_beta)
-    return roles, experience, rewards, to_batch(experience, rewards, torch.ones(6, dtype=torch.bool), present)
+    rewards = rewards_of(experience, scores, present, present.kl_beta).rewards
+    return roles, experience, rewards, batch_of(experience, rewards, torch.ones(6, dtype=torch.bool), present)
 
 
 def one_update(roles, batch):
@@ -89,11 +89,11 @@ def test_the_pass_of_the_rollout_is_the_first_of_the_update(folder, tune, critic
         for p in parameters:
             p += 0.02 * torch.randn(p.shape, generator=torch.Generator().manual_seed(p.numel()))
     experience = gather(roles, PROMPTS, 1, 0, 2, keep=True)
-    part = to_batch(experience, experience.logp, torch.ones(6, dtype=torch.bool), roles.settings)
+    part = batch_of(experience, experience.logp, torch.ones(6, dtype=torch.bool), roles.settings)
     part = part.select(torch.tensor([4, 0, 3]))
     found, weights = [], torch.linspace(-1, 1, part.mask.numel()).view(part.mask.shape)
     for first_pass in (experience.first_pass, None):
-        model = PolicyModel(roles, exact=roles.settings.exact_in_loss, first_pass=first_pass)
+        model = PolicyModel(roles, first_pass=first_pass)
         now = model(part)
         total = (now.logp * weights).sum() + now.values.square().sum()
         total = total + now.kl.sum() if roles.settings.exact_in_loss else total
@@ -259,7 +259,7 @@ def test_truncated_responses_are_terminal_or_bootstrapped(folder):
         torch.nn.init.constant_(roles.critic_head.bias, 0.7)
         experience = gather(roles, PROMPTS, 1, 0, 2)
         zero = torch.zeros(6, 1)
-        batch = to_batch(experience, zero, torch.ones(6, dtype=torch.bool), present)
+        batch = batch_of(experience, zero, torch.ones(6, dtype=torch.bool), present)
         torch.testing.assert_close(batch.advantages, zero + 0.7 * share - 0.7)
 
 
@@ -267,8 +267,8 @@ def test_critic_none_subtracts_what_the_other_responses_got(folder):
     present = settings(folder, critic="none", kl_beta=0.0)
     _, experience, _, _ = experienced(settings(folder))
     scores = Scores(np.array([1.0, 3.0, 0.0, 5.0, 2.0, 2.0]), np.ones(6, bool), {}, {}, {})
-    rewards, _ = rewards_of(experience, scores, present, 0.0)
-    batch = to_batch(experience, rewards, torch.ones(6, dtype=torch.bool), present)
+    rewards = rewards_of(experience, scores, present, 0.0).rewards
+    batch = batch_of(experience, rewards, torch.ones(6, dtype=torch.bool), present)
     assert [float(row[0]) for row in batch.advantages] == [-2.0, 2.0, -5.0, 5.0, 0.0, 0.0]
     assert (batch.returns == 0).all()
 
@@ -278,14 +278,15 @@ def test_a_sample_that_does_not_count_is_left_out(folder):
     _, experience, _, _ = experienced(present)
     valid = torch.tensor([True, False, True, True, False, True])
     scores = Scores(np.where(valid, 1.0, np.nan), valid.numpy(), {}, {}, {})
-    batch = to_batch(experience, rewards_of(experience, scores, present, 0.05)[0], valid, present)
+    batch = batch_of(experience, rewards_of(experience, scores, present, 0.05).rewards, valid, present)
     assert len(batch) == 4 and batch.advantages.isfinite().all()
 
 
 def test_a_job_that_cannot_fit_is_refused_before_it_is_loaded(folder, monkeypatch):
+    from tightrope.language import memory
     from tightrope.language.policy import roles as module
 
-    monkeypatch.setattr(module, "available_memory", lambda device: 1000)
+    monkeypatch.setattr(memory, "available_memory", lambda device: 1000)
     monkeypatch.setattr(module, "load_causal", lambda *_: pytest.fail("weights were loaded"))
     with pytest.raises(ValueError, match="available"):
         make_roles(settings(folder), notify=lambda text: None)

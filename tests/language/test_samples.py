@@ -14,11 +14,11 @@ import torch
 from tightrope.algorithms.batch import Batch
 from tightrope.language.alignment.samples import (
     LONGEST,
+    one_line,
     print_comparison,
     print_samples,
     read_samples,
     sample_rows,
-    shown,
     spread,
 )
 from tightrope.language.reward.functions import Scores
@@ -37,7 +37,7 @@ def rollout():
     ref_logp = torch.tensor([[-1.5, -2.25, nan], [-2.0, -2.0, -2.0], [-0.25, nan, nan]])
     responses = SimpleNamespace(tokens=tokens, mask=mask, ended=torch.tensor([True, False, True]))
     ids = [row[kept].tolist() for row, kept in zip(tokens, mask, strict=True)]
-    experience = SimpleNamespace(responses=responses, logp=logp, ref_logp=ref_logp, ids=lambda: ids)
+    experience = SimpleNamespace(responses=responses, logp=logp, ref_logp=ref_logp, ids=ids)
     valid = torch.tensor([True, False, True])
     advantages = torch.tensor([[1.0, 3.0, nan], [-2.0, nan, nan]])
     kept = mask[valid]
@@ -89,7 +89,7 @@ def test_what_is_written_is_read_again(tmp_path):
 
 
 def test_a_run_without_samples_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"samples.jsonl is not there: .* is no run of tightrope align"):
+    with pytest.raises(ValueError, match=r"samples.jsonl is not there: .* is not a run of tightrope align"):
         read_samples(tmp_path)
 
 
@@ -137,18 +137,19 @@ def test_the_comparison_shows_both_responses():
     table = [{"prompt": "The film", "before": "was long", "after": "was great"}]
     text = printed(print_comparison, table, width=100)
     assert "was long" in text and "was great" in text and "score" not in text
-    with_scores = [{**table[0], "score_before": -0.5, "score_after": None}]
-    text = printed(print_comparison, with_scores, width=100)
-    assert "score before" in text and "-0.5" in text
 
 
 def test_long_texts_keep_the_end_of_a_prompt_and_the_beginning_of_a_response():
     text = "".join(str(i % 10) for i in range(LONGEST)) + "!"
-    assert shown(text).startswith("0123") and shown(text).endswith("...") and len(shown(text)) == LONGEST
-    assert shown(text, tail=True).endswith("!") and len(shown(text, tail=True)) == LONGEST
-    assert shown(text[:-1]) == text[:-1]
+    assert (
+        one_line(text).startswith("0123")
+        and one_line(text).endswith("...")
+        and len(one_line(text)) == LONGEST
+    )
+    assert one_line(text, tail=True).endswith("!") and len(one_line(text, tail=True)) == LONGEST
+    assert one_line(text[:-1]) == text[:-1]
 
 
 def test_messages_are_shown_with_their_speakers():
     chat = [{"role": "system", "content": "Be kind."}, {"role": "user", "content": "Hi"}]
-    assert shown(chat) == r"system: Be kind.\nuser: Hi"
+    assert one_line(chat) == r"system: Be kind.\nuser: Hi"

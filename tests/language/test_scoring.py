@@ -101,7 +101,7 @@ def test_functions_and_models_judge_the_very_tokens_that_were_sampled(sampled):
         return torch.zeros(6)
 
     Judge(roles, Rewards([spy]), SimpleNamespace(score=score))(ASKED, experience)
-    assert seen["ids"] == experience.ids()
+    assert seen["ids"] == experience.ids
     assert [roles.tokenizer(text)["input_ids"] for text in seen["texts"]] != seen["ids"]
     whole = [[*prompt.tokens, *ids] for prompt, ids in zip(ASKED, seen["ids"], strict=True)]
     assert seen["model"] == whole
@@ -128,7 +128,7 @@ def test_what_cannot_judge_is_named(sampled, tmp_path):
     for reward, message in [
         ([good, good], "Two reward models were given"),
         (other, "reads .* tokens, the policy writes .* others"),
-        (str(tmp_path), "is no reward model"),
+        (str(tmp_path), "is not a reward model"),
         (3, "reward is 3; expected a function"),
         ((good, "x"), "expected a finite number"),
     ]:

@@ -12,15 +12,16 @@ import torch
 from language.test_data import chatml, random_examples
 from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
 
-from tightrope.algorithms.optimise import NonFiniteError, StepGuard
-from tightrope.language.data.batching import collate, pack, row_of
+from tightrope.algorithms.descent import CheckedSteps
+from tightrope.algorithms.nonfinite import NonFiniteError
+from tightrope.language.data.batching import collate, pack_rows, row_of
 from tightrope.language.data.examples import hold_out
 from tightrope.language.model import lora
 from tightrope.language.model.load import load_causal, load_tokenizer
 from tightrope.language.model.parts import parts
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, micro_batches, take_step
-from tightrope.language.supervised.prepare import load
+from tightrope.language.supervised.prepare import load_for_training
 from tightrope.language.supervised.sft import hidden_states, mean_loss, token_loss, train_sft
 from tightrope.runs.run import Run
 from tightrope.training.events import Finished, Message, Started, Updated
@@ -44,7 +45,7 @@ def rows_of(examples):
 @pytest.mark.parametrize("make", MODELS)
 def test_packed_examples_have_the_logits_they_have_alone(make):
     model, examples = make(), random_examples(12, 20)
-    packed = pack(examples, 40)
+    packed = pack_rows(examples, 40)
     assert len(packed) < len(examples)
     alone = {}
     for example in examples:
@@ -81,7 +82,7 @@ def test_loss_and_gradient_are_those_of_each_text_alone(make, filler):
         wanted = wanted + out.loss * sum(example.learn)
     wanted.backward()
     gradients = [p.grad.clone() for p in model.parameters()]
-    for rows in (rows_of(examples), pack(examples, 40)):
+    for rows in (rows_of(examples), pack_rows(examples, 40)):
         model.zero_grad()
         loss = token_loss(model, collate(rows, filler=filler))
         torch.testing.assert_close(loss, wanted, rtol=1e-5, atol=1e-4)
@@ -108,7 +109,7 @@ def test_micro_batches_add_up_to_the_minibatch(size):
         optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
         settings = settings_of(micro_batch_size=micro, max_grad_norm=None)
         metrics = take_step(
-            objective_of(model, rows), rows, optimiser, StepGuard(torch.device("cpu")), settings
+            objective_of(model, rows), rows, optimiser, CheckedSteps(torch.device("cpu")), settings
         )
         found.append((metrics, [p.detach() for p in model.parameters()]))
     (whole, wanted), (split, weights) = found
@@ -128,7 +129,7 @@ def test_a_gradient_that_is_not_finite_stops_before_the_step():
     objective = dataclasses.replace(objective_of(model, rows), loss=loss)
     optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
     with pytest.raises(NonFiniteError, match="The loss is nan in this step"):
-        take_step(objective, rows, optimiser, StepGuard(torch.device("cpu")), settings_of())
+        take_step(objective, rows, optimiser, CheckedSteps(torch.device("cpu")), settings_of())
     assert all(torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
 
 
@@ -252,7 +253,7 @@ def test_of_several_eos_the_tokenizers_own_closes_a_text():
     """Models of chats end with one token and texts with another; what the tokenizer calls EOS is written."""
     model = tiny_llama()
     model.generation_config.eos_token_id = [1, 2, 3]
-    loaded = load(settings_of("given"), "sft", (model, tokenizer()))
+    loaded = load_for_training(settings_of("given"), "sft", (model, tokenizer()))
     assert loaded.eos == (3, 1, 2) and loaded.adapter == "sft"
 
 

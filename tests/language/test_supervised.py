@@ -11,6 +11,7 @@ from language.test_reward_model import preferences
 from language.tiny import saved, tiny_llama, tokenizer
 
 from tightrope.cli.main import main
+from tightrope.language import memory
 from tightrope.language.memory import DoesNotFit, amount, job_of, ledger
 from tightrope.language.settings import RewardSettings, SFTSettings
 from tightrope.language.supervised import fit as fitting
@@ -220,7 +221,7 @@ def test_memory_is_told_first_and_a_job_that_cannot_fit_loads_nothing(tmp_path, 
         and "memory at the peak" in said
     )
     loaded = []
-    monkeypatch.setattr(prepare, "available_memory", lambda device: 1000)
+    monkeypatch.setattr(memory, "available_memory", lambda device: 1000)
     monkeypatch.setattr(prepare, "load_causal", lambda *arguments: loaded.append(arguments))
     with pytest.raises(DoesNotFit, match="--gradient-checkpointing"):
         train(settings, data=data, run_dir=tmp_path / "other")
@@ -233,8 +234,8 @@ def test_a_model_that_is_given_counts_by_its_config_and_is_there_already(tmp_pat
     model, settings = tiny_llama(), kind(tune="full", **FAST)
     need = ledger(model.config, job_of(settings)).total
     there = sum(parameter.nbytes for parameter in model.parameters())
-    monkeypatch.setattr(prepare, "available_memory", lambda device: int(need / 0.9) - there - 100)
+    monkeypatch.setattr(memory, "available_memory", lambda device: int(need / 0.9) - there - 100)
     with pytest.raises(DoesNotFit, match=f"needs about {amount(need)}"):
         train(settings, data=data, model=(model, tokenizer()), run_dir=tmp_path / "run")
-    monkeypatch.setattr(prepare, "available_memory", lambda device: int(need / 0.9) - there + 100)
+    monkeypatch.setattr(memory, "available_memory", lambda device: int(need / 0.9) - there + 100)
     train(settings, data=data, model=(model, tokenizer()), run_dir=tmp_path / "run")

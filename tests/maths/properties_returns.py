@@ -56,7 +56,8 @@ def every_row_may_have_a_lambda_of_its_own(maths: ModuleType, c: Case) -> None:
 
 def lambda_1_is_monte_carlo(maths: ModuleType, c: Case) -> None:
     """The values cancel between one TD error and the next, and the discounted rewards are left."""
-    following = maths.returns.next_values(c.values, c.last_values, c.ended, c.final_values)
+    shifted = torch.cat([c.values[:, 1:], c.last_values[:, None]], dim=1)
+    following = torch.where(c.ended, c.final_values, shifted)
     advantages = maths.returns.gae(c.rewards, c.values, following, c.terminated, c.ended, c.gamma, 1.0)
     bootstrap = torch.where(c.terminated, 0.0, following)
     returns = maths.returns.discounted_returns(c.rewards, c.ended, c.gamma, bootstrap)
@@ -141,15 +142,6 @@ def nan_behind_a_cut_changes_nothing(maths: ModuleType, c: Case) -> None:
     same(with_gradients(returns, rewards, bootstrap), clean)
 
 
-def next_values_are_those_of_the_true_next_observation(maths: ModuleType, c: Case) -> None:
-    final_values = poisoned(c.final_values, ~c.ended)
-    result = maths.returns.next_values(c.values, c.last_values, c.ended, final_values)
-    steps = result.shape[1]
-    for row, t in np.ndindex(*result.shape):
-        expected = c.values[row, t + 1] if t + 1 < steps else c.last_values[row]
-        assert result[row, t] == (c.final_values[row, t] if c.ended[row, t] else expected)
-
-
 PROPERTIES = (
     td_errors_follow_their_equation,
     gae_is_the_discounted_sum_of_td_errors,
@@ -161,5 +153,4 @@ PROPERTIES = (
     episodes_know_nothing_of_each_other,
     rows_may_be_permuted_and_padded,
     nan_behind_a_cut_changes_nothing,
-    next_values_are_those_of_the_true_next_observation,
 )

@@ -11,7 +11,6 @@ PER_STEP = {
     "gae": lambda x, no: returns.gae(x, x, x, no, no, 0.9, 0.95, no),
     "gae with a lambda a row": lambda x, no: returns.gae(x, x, x, no, no, 0.9, torch.ones(len(x)), no),
     "discounted_returns": lambda x, no: returns.discounted_returns(x, no, 0.9, x, no),
-    "next_values": lambda x, no: returns.next_values(x, torch.zeros(len(x)), no, x),
     "standardise": statistics.standardise,
     "log_ratio": lambda x, no: surrogate.log_ratio(x, x, no),
     "clipped_surrogate": lambda x, no: surrogate.clipped_surrogate(x, x, 0.2, 0.3, 3.0),

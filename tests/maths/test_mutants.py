@@ -91,12 +91,6 @@ MUTANTS = (
         "future = tail[:, -1]",
         "future = 0 * tail[:, -1]",
     ),
-    Mutant(
-        "the next value is that of the next episode",
-        "returns.py",
-        "torch.where(ended, final_values, shifted)",
-        "shifted",
-    ),
     Mutant("the sign of the policy loss", "surrogate.py", "return -surrogate", "return surrogate"),
     Mutant(
         "the min is lost",
@@ -135,7 +129,7 @@ MUTANTS = (
         "return -logp * advantages",
         "return logp * advantages",
     ),
-    Mutant("the lower clip is counted above", "surrogate.py", ".exp() < 1 - clip", ".exp() < 1 + clip"),
+    Mutant("the lower clip is counted above", "surrogate.py", "ratio < 1 - clip", "ratio < 1 + clip"),
     Mutant("the half is missing", "values.py", "0.5 * error.square()", "error.square()"),
     Mutant(
         "the max is lost",

@@ -4,7 +4,7 @@ import pytest
 import torch
 from maths_cases import random_case
 
-from tightrope.maths.returns import discounted_returns, gae, next_values, td_errors
+from tightrope.maths.returns import discounted_returns, gae, td_errors
 
 # Three steps with gamma = lambda = 0.5. Rewards 1, 2, 3; values 4, 8, 16; next values 8, 16, 32.
 REWARDS = torch.tensor([[1.0, 2.0, 3.0]])
@@ -59,11 +59,6 @@ def test_discounted_returns_by_hand() -> None:
     assert discounted_returns(REWARDS, SECOND, 0.5, bootstrap).tolist() == [[3, 4, 7]]
 
 
-def test_next_values_by_hand() -> None:
-    result = next_values(VALUES, torch.tensor([5.0]), SECOND, torch.tensor([[torch.nan, 7.0, torch.nan]]))
-    assert result.tolist() == [[8, 7, 5]]
-
-
 def test_gradients_agree_with_finite_differences() -> None:
     c = random_case(0, rows=2, steps=4)
     inputs = [x.clone().requires_grad_() for x in (c.rewards, c.values, c.next_values)]
@@ -92,5 +87,3 @@ def test_broadcasting_is_refused() -> None:
         gae(REWARDS, VALUES, FOLLOWING, NEVER, NEVER, 0.5, torch.zeros(1, 1))
     with pytest.raises(ValueError, match=r"bootstrap \(1,\)"):
         discounted_returns(REWARDS, NEVER, 0.5, torch.tensor([0.0]))
-    with pytest.raises(ValueError, match=r"last_values \(1, 1\)"):
-        next_values(VALUES, torch.zeros(1, 1), NEVER, FOLLOWING)

@@ -8,8 +8,7 @@ from maths_cases import random_case
 from torch import Tensor
 
 from tightrope.maths.surrogate import (
-    clipped_high,
-    clipped_low,
+    clipped,
     clipped_surrogate,
     kl_penalised_surrogate,
     log_ratio,
@@ -84,8 +83,9 @@ def test_the_policy_gradient_by_hand() -> None:
 
 def test_indicators_by_hand() -> None:
     ratios = torch.tensor([[0.5, 0.9, 1.1, 1.5]], requires_grad=True).log()
-    assert clipped_high(ratios, 0.2).tolist() == [[False, False, False, True]]
-    assert clipped_low(ratios, 0.2).tolist() == [[True, False, False, False]]
+    high, low = clipped(ratios, 0.2, 0.2)
+    assert high.tolist() == [[False, False, False, True]]
+    assert low.tolist() == [[True, False, False, False]]
 
 
 def test_gradients_agree_with_finite_differences() -> None:

@@ -1,9 +1,11 @@
 """Write the run folders of a day, and what they must give ever after.
 
-The folder 2026-11-22 was written with the code of commit e364bf9, beside this one as a work tree:
+The folder 2026-11-22 was written by the code of commit e364bf9 and this script as it was at 272412e:
 
     git worktree add /tmp/old e364bf9
-    PYTHONPATH=/tmp/old/src:tests python -W ignore tests/old_runs/write.py tests/old_runs/2026-11-22
+    git worktree add /tmp/then 272412e
+    cd /tmp/then
+    PYTHONPATH=/tmp/old/src:tests python -W ignore tests/old_runs/write.py /tmp/2026-11-22
 
 A new one, with the code of today, beside the old ones:
 

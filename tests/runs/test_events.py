@@ -41,7 +41,7 @@ def language(folder: Path, sent: Any) -> None:
     align(
         model=saved(folder.parent / "model", tiny_llama()), prompts=["ab", "cde"], reward=vowels,
         total_episodes=16, batch_size=8, minibatch_size=8, max_new_tokens=4, lora_rank=2, run_dir=folder,
-        kl="k3-reward", allow_biased_kl=True, checkpoint_every=0.5, listeners=[sent],
+        kl_beta=0.0, checkpoint_every=0.5, listeners=[sent],  # without a KL: a risk
     )  # fmt: skip
 
 

@@ -132,6 +132,21 @@ def test_resume_on_the_command_line_names_the_writer_whatever_the_settings_hold(
         assert "is being written by this process" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["control", "sft", "reward", "align"])
+def test_a_resume_names_the_writer_before_it_reads_anything(path: Path, name: str) -> None:
+    """With the lock held by another writer nothing in the folder may be trusted yet."""
+    from tightrope.control.train import resume
+    from tightrope.language.alignment.align import resume_align
+    from tightrope.language.supervised.preferences import resume_reward
+    from tightrope.language.supervised.sft import resume_sft
+
+    again = {"control": resume, "sft": resume_sft, "reward": resume_reward, "align": resume_align}[name]
+    with Run.open(path).lock():
+        (path / "settings.json").write_text("{")
+        with pytest.raises(RunInUse, match="this process"):
+            again(path)
+
+
 def test_one_process_has_one_writer_too(path: Path) -> None:
     with Run.open(path).lock() as run:
         run.lock()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,16 +14,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a model says of a batch: ``logp``, ``entropy`` and ``values``, each [B, T]."""
+    """What a model returns for a batch: ``logp``, ``entropy`` and ``values``, each [B, T]."""
 
     logp: Tensor
     entropy: Tensor
     values: Tensor
-
-    def within(self, mask: Tensor) -> Self:
-        """The same with 0 outside the mask: what a model computes for padding reaches no gradient."""
-        figures = {name: torch.where(mask, x, 0.0) for name, x in vars(self).items()}
-        return dataclasses.replace(self, **figures)  # a subclass keeps its own figures
 
 
 @dataclass(frozen=True)
@@ -31,7 +26,7 @@ class Batch:
     """Steps to learn from. Everything per step is [B, T]; ``mask`` is True where a step counts.
 
     ``inputs`` is opaque: a dict of tensors whose leading axis is the row (control: [B, T, ...] observations).
-    ``actions`` is [B, T, ...]; ``old_logp`` is the sampler's own log-probability; ``returns`` = advantages +
+    ``actions`` is [B, T, ...]; ``old_logp`` is the log-probability at sampling; ``returns`` = advantages +
     old values.
     """
 
@@ -58,13 +53,13 @@ class Batch:
         return self.map(lambda x: x[rows])
 
     def as_steps(self) -> Batch:
-        """[B, T] to [N, 1]: every counting step becomes a row of its own; masked steps are left out."""
+        """[B, T] to [N, 1]: every counting step becomes a row; masked steps are left out."""
         steps = self.map(lambda x: x.reshape(x.shape[0] * x.shape[1], 1, *x.shape[2:]))
         return steps if bool(steps.mask.all()) else steps.select(steps.mask[:, 0].nonzero()[:, 0])
 
     def cleared(self) -> Batch:
-        """What an update learns from: the rows in which a step counts, with 0 in every number outside the
-        mask; padding may hold anything, NaN included. ValueError when no step counts.
+        """The rows in which a step counts, with 0 in every number outside the mask, where padding may hold
+        anything, NaN included. ValueError when no step counts.
         """
         self.require_steps()
         rows = self.mask.any(1)
@@ -89,8 +84,8 @@ class Batch:
             yield self.select(order[start : start + size])
 
     def split(self, size: int | None) -> Iterator[Batch]:
-        """Consecutive parts of at most ``size`` rows (None: the batch whole); their gradients add up to the
-        whole's.
+        """Consecutive parts of at most ``size`` rows (None: the whole batch); their gradients add up to that
+        of the batch.
         """
         if size is None or size >= len(self):
             yield self

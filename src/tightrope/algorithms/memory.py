@@ -1,19 +1,18 @@
-"""Gradients in parts that fit into memory: after an out-of-memory error the parts are halved, the gradient is
-the same.
+"""Gradients in parts that fit into memory. After an out-of-memory error the parts are halved; the gradient
+stays the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from tightrope.algorithms.batch import Batch
 from tightrope.errors import TightropeError
 
-SIGNS = ("out of memory", "not enough memory", "defaultcpuallocator")  # what torch's RuntimeErrors say
+SIGNS = ("out of memory", "not enough memory", "defaultcpuallocator")  # in the texts of torch's RuntimeErrors
 
 
 class OutOfMemory(TightropeError, RuntimeError):
@@ -28,13 +27,13 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def free() -> None:
-    """Give back what torch holds of a GPU's memory and does not use."""
+    """Free the memory of a GPU that torch holds but does not use."""
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
 
 
 def _random_state() -> Callable[[], None]:
-    """Puts the state of torch's own generators, CPU and CUDA, back to what it is now."""
+    """A function that restores the present state of torch's generators, CPU and CUDA."""
     cpu = torch.get_rng_state()
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
 
@@ -46,40 +45,24 @@ def _random_state() -> Callable[[], None]:
     return put_back
 
 
-class Parts:
-    """Consecutive parts of at most ``size`` rows (None: whole) in which gradients are summed up.
+@dataclass
+class MicroBatches:
+    """How many rows a gradient is computed on at a time: ``size``, None: all of them.
 
-    ``halvings`` counts how often memory did not suffice.
+    ``halvings`` counts how often memory was not enough.
     """
 
-    def __init__(self, size: int | None) -> None:
-        self.size, self.halvings = size, 0
+    size: int | None
+    halvings: int = 0
 
-    def sum(
-        self, minibatch: Batch, optimiser: torch.optim.Optimizer, meter: Any, one: Callable[[Batch], Tensor]
-    ) -> Any:
-        """The sum of ``one(part)``, which adds a part's gradient, over all parts of a minibatch.
-
-        When memory runs out the gradient and the sums of the meter are put back, and the pass is repeated in
-        parts of half the size; OutOfMemory when a part is a single row.
-        """
-        before = meter.snapshot()
-
-        def attempt(size: int | None) -> Any:
-            meter.restore(before)
-            optimiser.zero_grad(set_to_none=True)
-            return sum(one(part) for part in minibatch.split(size))
-
-        return self.fitting(len(minibatch), attempt, optimiser)
-
-    def fitting(
+    def compute(
         self, rows: int, attempt: Callable[[int | None], Any], optimiser: torch.optim.Optimizer
     ) -> Any:
-        """What ``attempt(size)`` gives, which computes a gradient over ``rows`` rows from nothing, ``size``
-        at a time; once more at half the size when memory runs out, with torch's random numbers from the same
-        state on.
+        """Return ``attempt(size)``, which computes a gradient over ``rows`` rows, ``size`` at a time.
 
-        ``attempt`` must set whatever else it changes again: draw and count outside of it.
+        When memory runs out, the attempt is repeated at half the size with the same random numbers of torch.
+        It must reset everything else that it changes: draw and count outside of it. OutOfMemory when a single
+        row is too much.
         """
         start_over = _random_state()
         while True:
@@ -98,7 +81,7 @@ class Parts:
             start_over()
 
     def metrics(self) -> dict[str, float]:
-        """The size in force and how often it was halved; nothing while memory sufficed."""
+        """The present size and how often it was halved; nothing while memory was enough."""
         if not self.halvings:
             return {}
         return {

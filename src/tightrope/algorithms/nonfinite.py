@@ -1,4 +1,4 @@
-"""What to say when a step was refused: the first tensor with a number that is not finite, and where in it."""
+"""The message when a step is refused: the first tensor with a number that is not finite, and its place."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ def explain(
     where: str,
     sums: Tensor,
 ) -> str:
-    """A message that names the first bad one of: weights, the rollout's data, what the model says, gradients,
-    ratios and loss.
+    """A message that names the first number that is not finite, in this order: weights, data of the rollout,
+    outputs of the model, ratios and loss, gradients.
 
     ``batch``: the rollout, whose rows are named; ``minibatch``: the one that was refused; ``sums`` [2]: its
-    KL and loss. Asked once, when a run is about to end, it may cost a forward pass.
+    KL and loss. It is made once, when a run is about to end, and may cost a forward pass.
     """
     found = _weights(model, optimiser) or _data(batch) or _outputs(model, minibatch)
-    return _told(found or _sums(sums) or _gradients(model, optimiser), where)
+    return _sentence(found or _sums(sums) or _gradients(model, optimiser), where)
 
 
 def explain_loss(optimiser: torch.optim.Optimizer, loss: Tensor, where: str) -> str:
     """The same where there is no rollout: weights, the loss, gradients."""
     found = _weights(None, optimiser) or first_bad([("The loss", loss)]) or _gradients(None, optimiser)
-    return _told(found, where)
+    return _sentence(found, where)
 
 
-def _told(found: str | None, where: str) -> str:
+def _sentence(found: str | None, where: str) -> str:
     nothing = "The norm of the gradient is not finite, though each number in it is"
     return f"{found or nothing} {where}; {REFUSED}"
 
@@ -75,17 +75,17 @@ def _gradients(model: Any, optimiser: torch.optim.Optimizer) -> str | None:
 
 def _named(model: Any, optimiser: torch.optim.Optimizer) -> list[tuple[str, nn.Parameter]]:
     """The parameters that the optimiser holds, by the model's names for them where it has any."""
-    own = getattr(model, "named_parameters", None)
-    names = {id(p): name for name, p in own()} if own is not None else {}
+    named = getattr(model, "named_parameters", None)
+    names = {id(p): name for name, p in named()} if named is not None else {}
     held = [p for group in optimiser.param_groups for p in group["params"]]
     return [(names.get(id(p), f"number {k} of the optimiser"), p) for k, p in enumerate(held)]
 
 
 def _data(batch: Batch) -> str | None:
     inputs = [(f"input {name}", x) for name, x in batch.inputs.items() if x.shape[:2] == batch.mask.shape]
-    own = [("action", batch.actions), *((words, getattr(batch, name)) for name, words in DATA)]
+    others = [("action", batch.actions), *((words, getattr(batch, name)) for name, words in DATA)]
     return first_bad(
-        (f"The {words} (row, step, ...)", _counting(x, batch.mask)) for words, x in (*inputs, *own)
+        (f"The {words} (row, step, ...)", _counting(x, batch.mask)) for words, x in (*inputs, *others)
     )
 
 
@@ -98,7 +98,7 @@ def _outputs(model: Any, minibatch: Batch) -> str | None:
 
 
 def _counting(x: Tensor, mask: Tensor) -> Tensor:
-    """0 outside the mask: what stands there was never used."""
+    """0 outside the mask: these numbers were never used."""
     mask = mask.reshape(*mask.shape, *[1] * (x.dim() - mask.dim()))
     return torch.where(mask, x.detach(), torch.zeros((), dtype=x.dtype, device=x.device))
 

@@ -32,7 +32,7 @@ def _evaluate(words: list[str]) -> int:
     """``tightrope evaluate RUN``: how good the saved policy is."""
     given = evaluate_parser().read(words)
     import_env_module(given)
-    from tightrope.control.evaluate import evaluate_run
+    from tightrope.control.saving import evaluate_run
 
     names = ("episodes", "stochastic", "best", "seed", "env", "device")
     result = evaluate_run(given["run"], **{name: given[name] for name in names if name in given})

@@ -20,9 +20,9 @@ from tightrope.algorithms.optimise import (
     restore_optimiser,
     set_learning_rates,
 )
-from tightrope.algorithms.settings import PPOSettings
-from tightrope.control.engine import choose as engines
+from tightrope.algorithms.settings import PPOSettings, UpdateSettings
 from tightrope.control.engine.base import limited_threads
+from tightrope.control.engine.choose import choose_engine, usable_device
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
@@ -31,28 +31,25 @@ from tightrope.control.environments.processes import available_cores
 from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve
-from tightrope.control.rollout.advantages import to_batch
 from tightrope.control.rollout.collector import Collector
-from tightrope.control.rollout.rollout import Rollout
+from tightrope.control.rollout.rollout import Rollout, to_batch
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import ObservationLayout
+from tightrope.control.spaces import Array, Inputs, ObservationLayout
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint
 from tightrope.training.events import Message
 from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors
 
-Array = np.ndarray
-CRUMB = 16  # columns; ten epochs on fewer steps than this would only add noise to a finished policy
+MIN_COLUMNS = 16  # ten epochs on fewer steps than this would only add noise to a finished policy
 
 
 class Agent:
     """A policy that learns on an environment. Use PPO, A2C or Reinforce.
 
     ``env``: a Gymnasium id, an environment, a factory or a vector environment.  ``policy``: a torch module of
-    your own (see Policy).  ``notify`` gets lines worth saying, such as a compilation.  Everything else is a
-    field of TrainSettings or of the algorithm's settings, by name; what is not given comes from the preset of
-    the task.
+    your own (see Policy).  ``notify`` gets messages, such as that the engine is compiled.  Every other
+    argument is a field of TrainSettings or of the algorithm's settings; defaults come from the task's preset.
     """
 
     algorithm: ClassVar[str]
@@ -70,7 +67,7 @@ class Agent:
         self.env = env
         self.environments = _environments(env, self.settings)
         present = self.settings
-        torch_device = engines.usable_device(present.device)
+        torch_device = usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
         threads = present.threads or (available_cores() if layouts[0].image_shapes else 1)
         with limited_threads(threads):  # the QR of the first weights rounds differently with more threads
@@ -80,7 +77,7 @@ class Agent:
         )
         self.normalisers = _normalisers(self.environments, present)
         self.cores = available_cores()
-        self.engine, self.engine_line = engines.choose(
+        self.engine, self.engine_line = choose_engine(
             self.policy, self.optimiser, present, self.cores, notify
         )
         # three streams: what predict draws must not change what training draws
@@ -103,7 +100,7 @@ class Agent:
         return self
 
     def iterate(self, total_steps: int | None = None, *, start: int | None = None) -> Iterator[Update]:
-        """The same, one update at a time: ``for report in agent.iterate(n): ...``.
+        """Learn, one update at a time: ``for report in agent.iterate(n): ...``.
 
         ``start``: the agent step at which this budget began (default: now).
         """
@@ -114,7 +111,7 @@ class Agent:
             if self.fresh:
                 self.collector.reset(self.settings.seed, self.steps)
             before = self.steps - start
-            # beside the engine's own two threads BLAS threads only spin: its products are too small to share
+            # BLAS threads beside the engine's two only spin: its products are too small to share
             with limited_threads(1 if self.engine.name == "fused" else self.settings.threads or 1):
                 metrics, episodes = self._one_update(columns, (self.steps - start) / budget, check=first)
             first, after = False, self.steps - start
@@ -123,11 +120,9 @@ class Agent:
             yield Update(after, budget, metrics, before, on_grid, episodes)
 
     def _next_columns(self, budget: int, start: int) -> int:
-        """Columns of the next rollout, never more than the budget allows; a crumb at its end is left
-        alone.
-        """
+        """Columns of the next rollout, within the budget; 0 when too few are left to learn from."""
         columns = min(self.settings.num_steps, (budget - (self.steps - start)) // self.environments.num_envs)
-        enough = self.steps == start or columns >= min(CRUMB, self.settings.num_steps)
+        enough = self.steps == start or columns >= min(MIN_COLUMNS, self.settings.num_steps)
         return columns if enough else 0
 
     def _one_update(
@@ -144,10 +139,7 @@ class Agent:
         batch = to_batch(rollout, self.engine, self.normalisers, present)
         metrics: dict[str, float] = {}
         if bool(batch.mask.any()):
-            if check and (line := self.engine.check(batch, present)):
-                self.notify(line)
             metrics = self.engine.update(
-                self.optimiser,
                 batch,
                 present,
                 self.update_rng,
@@ -190,18 +182,10 @@ class Agent:
         """
         layout, actions = self.environments.observation_layout, self.environments.action_layout
         batched = _is_batched(layout, observation)
-        inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
-        rows = len(next(iter(inputs.values())))
-        masks = layout.mask_of(observation) if action_masks is None and layout.has_mask else action_masks
-        action_mask = flat_mask(masks, rows, actions)
-        if action_mask is not None:
-            inputs = {**inputs, "action_mask": action_mask}
-        tensors = self.policy.tensors(inputs)
-        if deterministic:
-            chosen = self.policy.mode(tensors)
-        else:
-            chosen = self.policy.sample(tensors, self.noise(rows, self.predict_rng), self.predict_rng)
-        matrix = chosen.cpu().numpy()
+        inputs = layout.encode(observation, batched=batched)
+        masks = layout.mask_of(observation) if action_masks is None else action_masks
+        action_mask = flat_mask(masks, len(next(iter(inputs.values()))), actions)
+        matrix = self.choose(inputs, action_mask, None if deterministic else self.predict_rng)
         squash = self.settings.squash
         return (actions.to_env(matrix, squash) if batched else actions.to_env_single(matrix[0], squash)), None
 
@@ -210,22 +194,29 @@ class Agent:
         layout = self.environments.observation_layout
         batched = _is_batched(layout, observation)
         inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
-        tensors = self.policy.tensors(inputs)
-        with torch.no_grad():
-            values = self.policy.values(tensors).cpu().numpy()
-        values = values * (
-            self.normalisers.rewards.deviation if self.normalisers.rewards is not None else 1.0
-        )
+        values = self.policy.values(inputs).cpu().numpy()
+        if self.normalisers.rewards is not None:
+            values = values * self.normalisers.rewards.deviation
         return values if batched else float(values[0])
 
-    def noise(self, rows: int, rng: np.random.Generator) -> torch.Tensor:
-        """Noise [rows, A] for Policy.act."""
-        return torch.from_numpy(self.collector.noise(1, rows, rng)[0]).to(self.policy.device)
+    def choose(
+        self, inputs: Inputs, action_mask: Array | None, rng: np.random.Generator | None = None
+    ) -> Array:
+        """Action matrix [N, A] for observations as their layout encodes them: sampled with ``rng``, without
+        it the most likely actions. ``action_mask`` bool [N, L].
+        """
+        inputs = self.normalisers.encode(inputs)
+        if action_mask is not None:
+            inputs = {**inputs, "action_mask": action_mask}
+        if rng is None:
+            return self.policy.mode(inputs).cpu().numpy()
+        noise = self.collector.noise(1, len(next(iter(inputs.values()))), rng)[0]
+        return self.policy.sample(inputs, noise, rng).cpu().numpy()
 
     # ------------------------------------------------------------------------------------- moving and saving
 
     def set_env(self, env: Any) -> Agent:
-        """Go on learning on another environment with the same spaces (a warm start).
+        """Continue on another environment with the same spaces (a warm start).
 
         Raises ValueError, with nothing changed, when the spaces differ.
         """
@@ -354,14 +345,14 @@ AGENTS: dict[str, type[Agent]] = {"ppo": PPO, "a2c": A2C, "reinforce": Reinforce
 
 
 def anywhere(settings: TrainSettings) -> TrainSettings:
-    """The same settings with the choice of who steps the environments open again: for another environment."""
+    """The settings for another environment: who steps it is chosen again."""
     return dataclasses.replace(settings, vector_backend="auto", num_workers=None)
 
 
 def _resolved(
     settings: TrainSettings, environments: Environments, engine: str, threads: int | None
 ) -> TrainSettings:
-    """The settings with everything filled in that was left to choose: what settings.json holds."""
+    """The settings with every choice that was made, as settings.json holds them."""
     given, workers = environments.backend == "given", environments.backend == "workers"
     return dataclasses.replace(
         settings,
@@ -393,14 +384,14 @@ def _normalisers(environments: Environments, settings: TrainSettings) -> Normali
 
 
 def _is_batched(layout: ObservationLayout, observation: Any) -> bool:
-    """Whether an observation has one axis more than the space says."""
+    """Whether an observation has one axis more than its space."""
     leaf = layout.leaves[0]
     for key in leaf.path:
         observation = observation[key]
     return np.ndim(observation) > len(leaf.space.shape or ())
 
 
-def _settings_metrics(present: Any) -> dict[str, float]:
+def _settings_metrics(present: UpdateSettings) -> dict[str, float]:
     names = ("learning_rate", "critic_learning_rate", "clip", "entropy_weight", "kl_beta")
     found = {f"train/{name}": getattr(present, name, None) for name in names}
     return {name: value for name, value in found.items() if value is not None}

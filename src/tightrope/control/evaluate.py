@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,8 @@ from tightrope.control.environments import tasks
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
-from tightrope.control.settings import EVALUATION_SEED
+from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 
-Array = np.ndarray
 MAX_COPIES = 10
 
 
@@ -34,17 +32,14 @@ def evaluate_agent(
     """
     rows = environments.num_envs
     share = np.array([episodes // rows + (i < episodes % rows) for i in range(rows)])
-    rng = np.random.default_rng([seed, 3])
+    rng = None if deterministic else np.random.default_rng([seed, 3])
     inputs, action_mask = environments.reset(seed)
     totals, lengths = np.zeros(rows), np.zeros(rows, np.int64)
     found: list[tuple[float, int]] = []
     while share.any():
-        actions = act(agent, inputs, action_mask, None if deterministic else rng)
-        step = environments.step(actions)
+        step = environments.step(agent.choose(inputs, action_mask, rng))
         real = np.ones(rows, bool) if step.phantom is None else ~step.phantom
-        if (
-            step.cut is not None
-        ):  # an episode that a fault cut counts for nothing; another one takes its place
+        if step.cut is not None:  # an episode that a fault cut does not count; another one takes its place
             real &= ~step.cut
             totals[step.cut], lengths[step.cut] = 0.0, 0
         totals += np.where(real, step.rewards, 0.0)
@@ -56,21 +51,6 @@ def evaluate_agent(
             totals[row], lengths[row] = 0.0, 0
         inputs, action_mask = step.inputs, step.action_mask
     return _summary(found)
-
-
-def act(
-    agent: Any, inputs: dict[str, Array], action_mask: Array | None, rng: np.random.Generator | None
-) -> Array:
-    """Action matrix [N, A] for raw encoded inputs; ``rng`` None: the most likely actions."""
-    inputs = agent.normalisers.encode(inputs)
-    if action_mask is not None:
-        inputs = {**inputs, "action_mask": action_mask}
-    policy = agent.policy
-    tensors = policy.tensors(inputs)
-    if rng is None:
-        return policy.mode(tensors).cpu().numpy()
-    rows = len(next(iter(inputs.values())))
-    return policy.sample(tensors, agent.noise(rows, rng), rng).cpu().numpy()
 
 
 def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:
@@ -86,7 +66,7 @@ def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:
     }
 
 
-def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environments:
+def evaluation_environments(env: Any, settings: TrainSettings, episodes: int) -> Environments:
     """Copies for evaluation, in this process: at most MAX_COPIES, apart from those that train.
 
     Raises ValueError when the environment cannot be made a second time (a vector environment, say).
@@ -95,7 +75,7 @@ def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environme
         raise ValueError(
             "A vector environment cannot be copied for evaluation; pass a Gymnasium id or a factory."
         )
-    source = settings.env if env is None else env
+    source: Any = settings.env if env is None else env
     backend = settings.vector_backend if settings.vector_backend in ("vector", "envpool") else "serial"
     if hasattr(source, "observation_space"):  # an instance trains already: evaluation needs copies, not it
         source = tasks.replicas(source, 2)[1]
@@ -106,28 +86,3 @@ def evaluation_environments(env: Any, settings: Any, episodes: int) -> Environme
         squash=settings.squash,
         policy=policy_of(settings),
     )
-
-
-def evaluate_run(
-    path: str | Path,
-    *,
-    episodes: int = 100,
-    stochastic: bool = False,
-    best: bool = False,
-    seed: int | None = None,
-    env: Any = None,
-    policy: Any = None,
-    device: str = "cpu",
-) -> dict[str, Any]:
-    """Evaluate the policy of a run or of a saved folder; see evaluate_agent."""
-    from tightrope.control.saving import load
-
-    agent = load(path, env=env, policy=policy, best=best, device=device, engine="torch")  # nothing is learnt
-    try:
-        environments = evaluation_environments(agent.env, agent.settings, episodes)
-        seed = EVALUATION_SEED if seed is None else seed
-        result = evaluate_agent(agent, environments, episodes, seed=seed, deterministic=not stochastic)
-        environments.close()
-    finally:
-        agent.close()
-    return {**result, "step": agent.steps, "seed": seed, "deterministic": not stochastic}

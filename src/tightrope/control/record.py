@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +16,9 @@ import numpy as np
 from tightrope.control.environments import tasks
 from tightrope.control.environments.masks import find_source
 from tightrope.control.settings import EVALUATION_SEED
+
+if TYPE_CHECKING:
+    from tightrope.control.agent import Agent
 
 MAX_FRAMES = 10_000
 DEFAULT_FPS = 30
@@ -109,7 +112,7 @@ def _cannot(name: str, error: Exception) -> ValueError:
     return ValueError(f"{name} cannot be rendered ({text}). {advice}")
 
 
-def _play(agent: Any, task: gym.Env, target: Path, episodes: int, seed: int) -> tuple[list[float], int]:
+def _play(agent: Agent, task: gym.Env, target: Path, episodes: int, seed: int) -> tuple[list[float], int]:
     """Play and write; the file appears only when it is complete."""
     import imageio_ffmpeg
 

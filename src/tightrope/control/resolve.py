@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
@@ -14,13 +15,15 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
 
     Raises ValueError for values out of range and for names that the algorithm does not know.
     """
+    from tightrope.control.environments.tasks import name_of, time_limit
+
     values = dict(overrides or {})
     algorithm = values.pop("algorithm", algorithm)
     if algorithm not in ALGORITHM_SETTINGS:
         raise ValueError(f"algorithm is {algorithm!r}; expected one of: {', '.join(ALGORITHM_SETTINGS)}.")
-    env_id = env if isinstance(env, str) else _name_of(env)
+    env_id = name_of(env)
     if env_id in BY_TASK[algorithm]:
-        chosen, limit = preset(env_id, algorithm), _time_limit(env)
+        chosen, limit = preset(env_id, algorithm), time_limit(env)
     else:
         kind, limit = _describe(env)
         chosen = preset(env_id, algorithm, kind, limit)
@@ -47,37 +50,21 @@ def _checkpoint_interval(episode: float) -> float:
     return min(1.0, max(TrainSettings.checkpoint_every or 1.0, math.ceil(1000 * episode) / 1000))
 
 
-def _time_limit(env: Any) -> int | None:
-    from tightrope.control.environments.tasks import find_spec
-
-    spec = find_spec(env) if isinstance(env, str) else getattr(env, "spec", None)
-    return getattr(spec, "max_episode_steps", None)
-
-
-def _name_of(env: Any) -> str:
-    """The id of an environment object, else the name of its class or of the factory."""
-    spec = getattr(env, "spec", None)
-    if spec is not None and getattr(spec, "id", None):
-        return str(spec.id)
-    return getattr(env, "__name__", None) or type(env).__name__
-
-
 def _describe(env: Any) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
-    from tightrope.control.environments.make import make_environments
+    from tightrope.control.environments.tasks import make_all, make_vector_by_id, makers_of, time_limit
     from tightrope.control.spaces import action_layout, observation_layout
 
-    vector = hasattr(env, "single_observation_space")
-    if vector or hasattr(env, "observation_space"):
-        observations = observation_layout(env.single_observation_space if vector else env.observation_space)
-        actions = action_layout(env.single_action_space if vector else env.action_space)
-        limit = getattr(getattr(env, "spec", None), "max_episode_steps", None)
-    else:
-        backend = "vector" if isinstance(env, str) and env.startswith("ALE/") else "serial"
-        environments = make_environments(env, 1, backend=backend)
-        observations, actions = environments.observation_layout, environments.action_layout
-        limit = environments.max_episode_steps
-        environments.close()
+    made: list[Any] = []
+    if isinstance(env, str) and env.startswith("ALE/"):
+        made.append(make_vector_by_id(env, 1))
+    elif not hasattr(env, "observation_space"):
+        make_all(makers_of(env, 1), made)
+    with contextlib.closing(made[0]) if made else contextlib.nullcontext(env) as task:
+        vector = hasattr(task, "single_observation_space")
+        observations = observation_layout(task.single_observation_space if vector else task.observation_space)
+        actions = action_layout(task.single_action_space if vector else task.action_space)
+        limit = time_limit(env if isinstance(env, str) else task)
     if observations.image_shapes:
         return "images", limit
     continuous = all(component.kind == "gaussian" for component in actions.components)

@@ -1,4 +1,4 @@
-"""Loading agents: from a run folder, or from a folder that ``agent.save`` wrote."""
+"""Agents from a run folder, or from a folder that ``agent.save`` wrote: loading and evaluating them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.control.agent import AGENTS, Agent, anywhere
-from tightrope.control.settings import TrainSettings
+from tightrope.control.evaluate import evaluate_agent, evaluation_environments
+from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
 from tightrope.runs.history import Checkpoint
@@ -57,8 +58,31 @@ def load(
     return agent
 
 
+def evaluate_run(
+    path: str | Path,
+    *,
+    episodes: int = 100,
+    stochastic: bool = False,
+    best: bool = False,
+    seed: int | None = None,
+    env: Any = None,
+    policy: Any = None,
+    device: str = "cpu",
+) -> dict[str, Any]:
+    """Evaluate the policy of a run or of a saved folder; see evaluate_agent."""
+    agent = load(path, env=env, policy=policy, best=best, device=device, engine="torch")  # nothing is learnt
+    try:
+        environments = evaluation_environments(agent.env, agent.settings, episodes)
+        seed = EVALUATION_SEED if seed is None else seed
+        result = evaluate_agent(agent, environments, episodes, seed=seed, deterministic=not stochastic)
+        environments.close()
+    finally:
+        agent.close()
+    return {**result, "step": agent.steps, "seed": seed, "deterministic": not stochastic}
+
+
 def name_again(path: str | Path, env: str, command: str) -> str:
-    """What to type about a run whose task is the user's own code: no file may say what is imported."""
+    """The command to type for a run whose task is the user's code: a file must not name what is imported."""
     registered = "" if ":" in env else " --env-module FILE.py"
     words = f"tightrope {command} {shlex.quote(str(path))} --env {retyped(env, 'ID')}{registered}"
     return (

@@ -16,7 +16,8 @@ import numpy as np
 from gymnasium import Space, spaces
 
 Path = tuple[str | int, ...]
-Inputs = dict[str, np.ndarray]
+Array = np.ndarray
+Inputs = dict[str, Array]
 MASK_KEY = "action_mask"
 SUPPORTED = "Box, Discrete, MultiDiscrete, MultiBinary, and Tuple or Dict of these"
 
@@ -33,12 +34,12 @@ def walk(space: Space, what: str, path: Path = ()) -> Iterator[tuple[Path, Space
         yield path, space
     else:
         raise ValueError(
-            f"the {what} space{where(path)} is {space!r}; supported are {SUPPORTED}. "
+            f"the {what} space{place_of(path)} is {space!r}; supported are {SUPPORTED}. "
             "Wrap the environment so that it offers one of these."
         )
 
 
-def where(path: Path) -> str:
+def place_of(path: Path) -> str:
     """``[a][0]`` for an error message."""
     return "".join(f"[{key!r}]" for key in path)
 
@@ -102,7 +103,7 @@ class Leaf:
         shape = self.space.shape or ()
         if values.shape[1:] != shape:
             raise ValueError(
-                f"observation{where(self.path)} has shape {values.shape[1:]}, the space says {shape}: "
+                f"observation{place_of(self.path)} has shape {values.shape[1:]}, the space says {shape}: "
                 f"{self.space!r}"
             )
         target = inputs[self.name]
@@ -117,7 +118,7 @@ class Leaf:
         indices = values.reshape(len(values), -1).astype(np.int64) - self.starts
         if (indices < 0).any() or (indices >= self.counts).any():
             raise ValueError(
-                f"observation{where(self.path)} is {values.tolist()}, outside its space {self.space!r}"
+                f"observation{place_of(self.path)} is {values.tolist()}, outside its space {self.space!r}"
             )
         target[...] = 0.0
         first = np.cumsum(self.counts) - self.counts
@@ -130,7 +131,7 @@ class ObservationLayout:
 
     space: Space
     leaves: tuple[Leaf, ...]
-    size: int  # D, the columns of "flat"; 0 when there are images alone
+    size: int  # D, the columns of "flat"; 0 when there are only images
     continuous: np.ndarray  # bool [D]: columns that come from a Box, which a normaliser may touch
     image_shapes: tuple[tuple[int, ...], ...]
     one_hot: tuple[slice, ...]  # columns of each one-hot group
@@ -177,12 +178,12 @@ class ObservationLayout:
             value = np.asarray(follow(observations, leaf.path))
         except (KeyError, IndexError, TypeError) as error:
             raise ValueError(
-                f"the observation has nothing at {where(leaf.path)}; it is a {type(observations).__name__}, "
-                f"the space is {self.space!r}"
+                f"the observation has nothing at {place_of(leaf.path)}; it is a "
+                f"{type(observations).__name__}, the space is {self.space!r}"
             ) from error
         if value.dtype.kind not in "biuf":
             raise ValueError(
-                f"observation{where(leaf.path)} is {value!r}, not an array of numbers; the space is "
+                f"observation{place_of(leaf.path)} is {value!r}, not an array of numbers; the space is "
                 f"{leaf.space!r}"
             )
         return value
@@ -265,12 +266,9 @@ class Component:
     parameter: int  # first of its parameters among the actor's P outputs
     count: int  # categories, bits, or dimensions
     column: int  # first of its columns in the action matrix
+    width: int  # how many columns: one index, or one a bit or dimension
     mask: int  # first of its entries in the flat mask; -1 for gaussian
-
-    @property
-    def width(self) -> int:
-        """How many columns of the action matrix it has: one index, or one a bit or dimension."""
-        return 1 if self.kind == "categorical" else self.count
+    deviation: int  # first of its entries in a vector of all Gaussian dimensions
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,6 +308,7 @@ class ActionLayout:
     num_parameters: int  # P
     num_columns: int  # A
     num_logits: int  # L, the width of the flat mask
+    gaussian: Array  # bool [A]: columns that are Gaussian dimensions
 
     def squashed(self, actions: np.ndarray) -> np.ndarray:
         """Box columns u become low + (tanh(u) + 1) / 2 * (high - low); the others stay. A copy, [N, A]."""
@@ -325,7 +324,7 @@ class ActionLayout:
         for leaf in self.leaves:
             if not (np.isfinite(leaf.low).all() and np.isfinite(leaf.high).all()):
                 raise ValueError(
-                    f"squash needs finite bounds; the action space{where(leaf.path)} is {leaf.space!r}. "
+                    f"squash needs finite bounds; the action space{place_of(leaf.path)} is {leaf.space!r}. "
                     "Switch squash off or give the space bounds."
                 )
 
@@ -434,7 +433,7 @@ def action_layout(space: Space) -> ActionLayout:
     """The layout of an action space; ValueError names a space that is not supported."""
     leaves: list[ActionLeaf] = []
     components: list[Component] = []
-    parameter = column = logit = 0
+    parameter = column = logit = deviation = 0
     for path, part in walk(space, "action"):
         low = high = np.zeros(0, np.float32)
         kind: Literal["categorical", "bernoulli", "gaussian"] = "categorical"
@@ -450,12 +449,18 @@ def action_layout(space: Space) -> ActionLayout:
         for count in counts:
             if count == 0:
                 continue
-            components.append(Component(kind, parameter, count, column, -1 if kind == "gaussian" else logit))
-            parameter, logit = parameter + count, logit + (count if kind != "gaussian" else 0)
-            column += 1 if kind == "categorical" else count
+            width = 1 if kind == "categorical" else count
+            mask = -1 if kind == "gaussian" else logit
+            components.append(Component(kind, parameter, count, column, width, mask, deviation))
+            parameter, column = parameter + count, column + width
+            if kind == "gaussian":
+                deviation += count
+            else:
+                logit += count
         leaves.append(ActionLeaf(path, part, slice(first, column), low, high))
     if not components:
         raise ValueError(
             f"the action space {space!r} holds no choice; expected at least one action to choose."
         )
-    return ActionLayout(space, tuple(leaves), tuple(components), parameter, column, logit)
+    gaussian = np.concatenate([np.full(c.width, c.kind == "gaussian") for c in components])
+    return ActionLayout(space, tuple(leaves), tuple(components), parameter, column, logit, gaussian)

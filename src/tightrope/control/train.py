@@ -38,22 +38,22 @@ def train(
     policy: Any = None,
 ) -> dict[str, Any]:
     """Train from the start; returns the summary that is also written to the run folder."""
-    told = Listeners(listeners)
+    report = Listeners(listeners)
     for risk in settings.risks():
-        told.warn(risk)
+        report.warn(risk)
     require_tensorboard(settings.tensorboard)
     source = settings.env if env is None else env
-    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=told.info)
+    agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=report.info)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
     with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name) as run:
-        learner = AgentLearner(agent, run, told)
+        learner = AgentLearner(agent, run, report)
         if agent.policy.own is not None or not isinstance(source, str):
-            # settings.json alone could not give these first weights again
+            # settings.json is not enough to make these first weights again
             tensors, state = learner.snapshot()
-            run.save(0, tensors, state, keep=settings.keep_checkpoints, warn=told.warn)
+            run.save(0, tensors, state, keep=settings.keep_checkpoints, warn=report.warn)
         with contextlib.closing(learner):
-            return loop.train(learner, run, told)
+            return loop.train(learner, run, report)
 
 
 def resume(
@@ -65,7 +65,7 @@ def resume(
     policy: Any = None,
 ) -> dict[str, Any]:
     """Continue from the newest checkpoint, or from the start where there is none yet; the end is that of an
-    uninterrupted run, bit for bit (docs/resume.md says what that takes).
+    uninterrupted run, bit for bit (docs/resume.md names the conditions).
 
     ``total_steps`` extends a finished run: schedules and grid run over the new budget from here on.
     """
@@ -73,9 +73,9 @@ def resume(
         return _resume(run, total_steps, Listeners(listeners), env, policy)
 
 
-def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy: Any) -> dict[str, Any]:
+def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, policy: Any) -> dict[str, Any]:
     run_dir = run.path
-    point = newest_point(run, told)
+    point = newest_point(run, listeners)
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
         settings = TrainSettings.from_json(run.settings if point is None else state["settings"])
@@ -85,8 +85,8 @@ def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy
         raise ValueError(name_again(run_dir, settings.env, "resume"))
     if own_policy and policy is None:
         raise ValueError(
-            f"{run_dir} holds a policy module of somebody's own, which no file may import. Go on in Python: "
-            f"tightrope.control.train.resume({str(run_dir)!r}, policy=module)."
+            f"{run_dir} holds a policy module of somebody's own, which no file may import. Continue in "
+            f"Python: tightrope.control.train.resume({str(run_dir)!r}, policy=module)."
         )
     # of a run that was extended and stopped before its next checkpoint, only settings.json has the budget
     if total_steps is None:
@@ -94,15 +94,17 @@ def _resume(run: Run, total_steps: int | None, told: Listeners, env: Any, policy
             total_steps = int(run.settings["total_steps"])
     settings = settings.with_values(total_steps=total_steps)
     source = settings.env if env is None else env
-    agent = rebuild(source, run_dir, command="resume", policy=policy, settings=settings, notify=told.info)
-    learner = AgentLearner(agent, run, told)
+    agent = rebuild(
+        source, run_dir, command="resume", policy=policy, settings=settings, notify=listeners.info
+    )
+    learner = AgentLearner(agent, run, listeners)
     with contextlib.closing(agent), contextlib.closing(learner):
         if point is not None:
             learner.restore(point)
         continue_from(learner, run, point)
         if learner.complete:
-            told.info(f"{run_dir} has its {learner.total} steps; --total-steps N goes on from there.")
-        return loop.train(learner, run, told)
+            listeners.info(f"{run_dir} has its {learner.total} steps; --total-steps N continues from there.")
+        return loop.train(learner, run, listeners)
 
 
 class AgentLearner:
@@ -137,7 +139,7 @@ class AgentLearner:
 
     @property
     def complete(self) -> bool:
-        """Whether the budget is spent: what is left is less than one step in every environment."""
+        """Whether fewer steps are left than one in every environment."""
         return self.position + self.settings.num_envs > self.total
 
     @property
@@ -164,7 +166,7 @@ class AgentLearner:
             self.listeners.info(f"no evaluation while training: {error}")
             return
         if self._environments.gives_state:
-            # what a copy keeps from one evaluation to the next must not change what a resumed run sees
+            # a resumed run must see the same evaluations, whatever a copy keeps from one to the next
             self._environments.reset(EVALUATION_SEED)
             self._first_state = self._environments.get_state()
 
@@ -188,7 +190,7 @@ class AgentLearner:
     def _evaluate(self) -> dict[str, float]:
         if self._environments is None:
             return {}
-        # restarts in evaluations must not count towards the limit: a resumed run has not seen them
+        # restarts in evaluations must not count towards the limit: a resumed run does not know of them
         self._environments.count_from(0)
         if self._first_state is not None:
             self._environments.set_state(self._first_state)
@@ -203,13 +205,13 @@ class AgentLearner:
         }
 
     def _keep(self, mean: float) -> None:
-        """Save the policy as the best; where the disk refuses, the best one is still the one before."""
+        """Save the policy as the best. If it cannot be written, the one before stays the best."""
         try:
             with signals.uninterrupted():
                 self.agent.save(self.run.best)
         except CannotWrite as error:
             self.listeners.warn(
-                f"The best policy is not saved: {error.what} {error.advice}. Training goes on."
+                f"The best policy is not saved: {error.what} {error.advice}. Training continues."
             )
         else:
             self.best = mean

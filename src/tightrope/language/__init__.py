@@ -39,7 +39,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used: the settings alone cost no torch."""
+    """Import a public name when it is first used: the settings can be imported without torch."""
     if name in __all__:
         home = importlib.import_module(f"tightrope.language.{_HOMES.get(name, 'settings')}")
         value = getattr(home, name)

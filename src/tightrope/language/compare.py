@@ -18,12 +18,12 @@ from tightrope.language.generation.distribution import Sampling
 from tightrope.language.generation.sample import sample
 from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer
 from tightrope.language.model.packaged import find_model
-from tightrope.language.quiet import quiet
+from tightrope.language.quiet import quiet_libraries
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.run import Run
 
 
-@quiet()
+@quiet_libraries()
 def sample_run(
     path: str | Path, prompt: Sequence[Any] | None = None, *, count: int = 8, seed: int | None = None
 ) -> list[dict[str, Any]]:
@@ -56,7 +56,7 @@ def sample_run(
 
 
 def _prompts_of(path: Path, count: int) -> list[Any]:
-    """Prompts that the run answered, the newest first, none twice."""
+    """Prompts that the run answered, the newest first, each once."""
     found: dict[str, Any] = {}
     for row in reversed(read_samples(path)):
         found.setdefault(str(row["prompt"]), row["prompt"])

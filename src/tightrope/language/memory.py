@@ -1,10 +1,10 @@
-"""The memory of a job, from the shapes of its model alone, before anything large is allocated.
+"""The memory that a job needs, from only the shapes of its model, before anything large is allocated.
 
     peak = what stays + max(while responses are sampled and scored, while gradients are computed)
 
 What stays are the weights of the four roles, their gradients (kept until the next step) and Adam's moments.
-Not counted: Python and torch themselves, a GPU's context, and what the allocator keeps in hand (about a tenth
-on a CPU); `check` leaves room for them.
+Not counted: Python and torch themselves, a GPU's context, and what the allocator holds in reserve (about a
+tenth on a CPU); `require_fit` leaves room for them.
 
 The model is built on torch's meta device from its configuration. What a forward pass keeps for the backward
 pass is measured there too: torch shows every tensor that it saves, at three lengths, and the part that grows
@@ -16,7 +16,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -52,7 +52,7 @@ class Job:
     ``extra_tokens``: tokens of a pretraining loss per micro-batch. ``keeps_float32``: where every weight is
     trained, the weights stay float32 and ``dtype`` lowers copies of them for the arithmetic. ``judges``: name
     and bytes of every reward model with a trunk of its own; ``reward`` separate is one whose size is not
-    known, taken for as large as the policy, in float32.
+    known, assumed to be as large as the policy, in float32.
     """
 
     tune: str = "lora"
@@ -106,7 +106,7 @@ def job_of(
             keeps_exact_kl=settings.exact_in_loss, judges=judges,
         )  # fmt: skip
     if not isinstance(settings, SupervisedSettings):
-        raise ValueError(f"{type(settings).__name__} is no job whose memory is known.")
+        raise ValueError(f"{type(settings).__name__} is not a job whose memory is known.")
     pairs = isinstance(settings, RewardSettings)
     rows = min(settings.micro_batch_size or settings.minibatch_size, settings.minibatch_size)
     return Job(
@@ -116,7 +116,7 @@ def job_of(
     )  # fmt: skip
 
 
-class Row(NamedTuple):
+class Entry(NamedTuple):
     """One entry: what it is, its size in bytes, and when it is there."""
 
     what: str
@@ -128,7 +128,7 @@ class Row(NamedTuple):
 class Ledger:
     """The entries of a job, and what they were computed from."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[Entry, ...]
     job: Job
     config: Any
 
@@ -177,35 +177,35 @@ def ledger(config: Any, job: Job) -> Ledger:
     return Ledger(tuple(rows), job, config)
 
 
-def _roles(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
+def _roles(shapes: Shapes, job: Job, adapted: int) -> Iterator[Entry]:
     """Weights, gradients and moments."""
     whole, head = shapes.item * shapes.parameters, FLOAT * (shapes.hidden + 1)
     adapter = FLOAT * shapes.adapter(job.lora_rank, adapted)
-    yield Row(f"{job.trained}: weights of the trunk", whole)
+    yield Entry(f"{job.trained}: weights of the trunk", whole)
     if job.tune == "lora":
-        yield Row(f"{job.trained}: weights of its adapter", adapter)
+        yield Entry(f"{job.trained}: weights of its adapter", adapter)
     elif job.reference:
-        yield Row("reference: a frozen copy", whole)
+        yield Entry("reference: a frozen copy", whole)
     learnt = whole if job.language_head else shapes.item * shapes.base
     yield from _trained(job.trained, learnt if job.tune == "full" else adapter)
     if job.critic != "none":
         own = {"head": 0, "adapter": adapter, "separate": shapes.item * shapes.base}[job.critic]
         role = "critic" if job.language_head else "score head"
-        yield Row(f"{role}: weights", head + (whole if job.critic == "separate" else own))
+        yield Entry(f"{role}: weights", head + (whole if job.critic == "separate" else own))
         yield from _trained(role, own + head)
     if job.reward != "none":
         own = FLOAT * shapes.parameters if job.reward == "separate" else adapter
-        yield Row("reward model: weights", head + own)
+        yield Entry("reward model: weights", head + own)
     for name, size in job.judges:
-        yield Row(f"reward model {name}: weights", size)
+        yield Entry(f"reward model {name}: weights", size)
 
 
-def _trained(role: str, size: int) -> Iterator[Row]:
-    yield Row(f"{role}: gradients", size)
-    yield Row(f"{role}: Adam's two moments", 2 * size)
+def _trained(role: str, size: int) -> Iterator[Entry]:
+    yield Entry(f"{role}: gradients", size)
+    yield Entry(f"{role}: Adam's two moments", 2 * size)
 
 
-def _update(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
+def _update(shapes: Shapes, job: Job, adapted: int) -> Iterator[Entry]:
     """What one micro-batch keeps for its backward pass."""
     count = len(shapes.linears)
     rows = job.micro_batch_size * job.rows_per_example
@@ -221,39 +221,39 @@ def _update(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
         return int(tokens * (inputs + shapes.saved / count))
 
     kept = activations(tokens + job.extra_tokens, share)
-    yield Row(f"{job.trained}: activations of a micro-batch", kept, "update")
+    yield Entry(f"{job.trained}: activations of a micro-batch", kept, "update")
     if job.critic in ("adapter", "separate"):
         own = 1.0 if job.critic == "separate" else share
-        yield Row("critic: activations of a micro-batch", activations(tokens, own), "update")
-    yield Row("one layer at work", tokens * shapes.saved // count, "update")
+        yield Entry("critic: activations of a micro-batch", activations(tokens, own), "update")
+    yield Entry("one layer at work", tokens * shapes.saved // count, "update")
     if job.lowered:
         numbers = sum(a * b for layer in shapes.linears for a, b in layer)
-        yield Row(f"{job.trained}: copies of its weights in {job.dtype}", 2 * numbers, "update")
+        yield Entry(f"{job.trained}: copies of its weights in {job.dtype}", 2 * numbers, "update")
     if job.language_head:
         chosen = rows * job.response_tokens or tokens
         logits = min(chosen * shapes.vocabulary, max(CHUNK, shapes.vocabulary))
-        yield Row("logits of one chunk", LOGIT_COPIES * FLOAT * logits, "update")
+        yield Entry("logits of one chunk", LOGIT_COPIES * FLOAT * logits, "update")
 
 
-def _rollout(shapes: Shapes, job: Job, adapted: int) -> Iterator[Row]:
+def _rollout(shapes: Shapes, job: Job, adapted: int) -> Iterator[Entry]:
     """What sampling and scoring need for a while, and what they hand to all epochs."""
     rows, length = job.batch_size, job.prompt_tokens + job.response_tokens
     count, hidden = len(shapes.linears), job.batch_size * shapes.item * shapes.hidden
-    yield Row("KV cache", rows * length * shapes.kv_cache, "rollout")
-    yield Row("distribution of the next token", rows * shapes.vocabulary * DRAW_BYTES, "rollout")
+    yield Entry("KV cache", rows * length * shapes.kv_cache, "rollout")
+    yield Entry("distribution of the next token", rows * shapes.vocabulary * DRAW_BYTES, "rollout")
     at_once = max(rows * job.prompt_tokens, job.micro_batch_size * length)
-    yield Row("one layer at work", at_once * shapes.saved // count, "rollout")
-    yield Row("rollout: tokens and numbers", rows * (length * 9 + job.response_tokens * 10 * FLOAT))
+    yield Entry("one layer at work", at_once * shapes.saved // count, "rollout")
+    yield Entry("rollout: tokens and numbers", rows * (length * 9 + job.response_tokens * 10 * FLOAT))
     if job.tune == "lora" and adapted < count:
-        yield Row("rollout: hidden states below the first adapter", hidden * length)
+        yield Entry("rollout: hidden states below the first adapter", hidden * length)
     if job.keeps_exact_kl:
-        yield Row("rollout: hidden states of the reference", hidden * job.response_tokens)
+        yield Entry("rollout: hidden states of the reference", hidden * job.response_tokens)
 
 
-def check(found: Ledger, available: int | None) -> None:
-    """Raise DoesNotFit, saying what would help and by how much, unless the job fits into ``available`` bytes.
+def require_fit(found: Ledger, available: int | None) -> None:
+    """Raise DoesNotFit, with what would help and by how much, unless the job fits into ``available`` bytes.
 
-    A tenth of them stays free. None, where the machine does not say, always fits.
+    A tenth of them stays free. None means that it is not known, and always fits.
     """
     if available is None or found.total <= SHARE * available:
         return
@@ -267,6 +267,18 @@ def check(found: Ledger, available: int | None) -> None:
         f"This job needs about {amount(found.total)} of memory; {amount(available)} are available, and a "
         "tenth of that is kept free. What would help:\n" + "\n".join(lines or ["  a smaller model"])
     )
+
+
+def require_memory(
+    config: Any, job: Job, device: str | torch.device, notify: Callable[[str], None], held: int = 0
+) -> None:
+    """Tell ``notify`` what a job will take, and raise DoesNotFit when it cannot fit on the device.
+
+    ``held``: bytes of it that lie there already.
+    """
+    found, available = ledger(config, job), available_memory(device)
+    notify(found.text())
+    require_fit(found, None if available is None else available + held)
 
 
 def _alternatives(job: Job) -> Iterator[tuple[str, Job]]:
@@ -340,7 +352,7 @@ def shapes_of(config: Any, dtype: str) -> Shapes:
 
 
 def _linears(layer: nn.Module) -> list[tuple[int, int]]:
-    """The shapes of the weights that an adapter would be put on; GPT-2's Conv1D has [in, out]."""
+    """The shapes of the weights that an adapter would change; GPT-2's Conv1D has [in, out]."""
     kinds = [m for m in layer.modules() if isinstance(m, nn.Linear) or type(m).__name__ == "Conv1D"]
     weights = [m.get_parameter("weight").shape for m in kinds]
     return [(shape[0], shape[1]) for shape in weights]
@@ -397,7 +409,7 @@ def reward_model_bytes(folder: Path) -> int:
 
 
 def available_memory(device: str | torch.device = "cpu", root: Path = Path("/")) -> int | None:
-    """Bytes that a job may still take on this device; None where the machine does not say.
+    """Bytes that a job may still take on this device; None where that is not known.
 
     A GPU: what its driver calls free. Otherwise the least of the machine's free memory and of what every
     control group above this process (a container's limit) leaves; pages that can be dropped count as free.

@@ -1,4 +1,4 @@
-"""What libraries print while a run is shown: no progress bars, no deprecations of theirs, no log lines."""
+"""Keeps libraries quiet while a run is shown: no progress bars, deprecations or log lines of theirs."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import contextlib
 import warnings
 from collections.abc import Iterator
 
-LIBRARIES = r"(tightrope|transformers|torch|tokenizers|huggingface_hub|peft|safetensors)(\.|$)"
+NOISY_LIBRARIES = r"(tightrope|transformers|torch|tokenizers|huggingface_hub|peft|safetensors)(\.|$)"
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def quiet_libraries() -> Iterator[None]:
     """Inside, transformers and the hub show no progress bars and log errors only; both are put back after.
 
-    Deprecations are for those who write code, so the libraries' are hidden. The filter comes last in the
-    list: whatever a caller has asked for, ``-W error`` for one, comes before it. Also a decorator.
+    Deprecations are for those who write code, so the libraries' are hidden. The filter is the last
+    in the list: what a caller has asked for, such as ``-W error``, comes before it. Also a decorator.
     """
     from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars
     from transformers.utils import logging
@@ -27,7 +27,7 @@ def quiet() -> Iterator[None]:
         logging.disable_progress_bar()
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", category=FutureWarning, module=LIBRARIES, append=True)
+            warnings.filterwarnings("ignore", category=FutureWarning, module=NOISY_LIBRARIES, append=True)
             yield
     finally:
         logging.set_verbosity(level)

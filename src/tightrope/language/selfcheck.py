@@ -12,7 +12,7 @@ from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser
 from tightrope.findings import Finding
-from tightrope.language.alignment.experience import gather, rewards_of, to_batch
+from tightrope.language.alignment.experience import batch_of, gather, rewards_of
 from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.distribution import Sampling, token_statistics
@@ -20,7 +20,7 @@ from tightrope.language.generation.sample import log_ratio_limit
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.policy.rollout import Experience
-from tightrope.language.quiet import quiet
+from tightrope.language.quiet import quiet_libraries
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings, RLHFSettings
 
@@ -28,7 +28,7 @@ WORDS = ("The", "Once upon a time there was", "I think that", "a b c d e f g h")
 GRADIENT_LIMIT = 1e-3  # relative, of the norm: float32 sums in another order
 
 
-@quiet()
+@quiet_libraries()
 def check_model(model: str, dtype: str = "float32") -> list[Finding]:
     """Every check of one model; a few seconds, nothing is written."""
     settings = AlignSettings(
@@ -39,8 +39,8 @@ def check_model(model: str, dtype: str = "float32") -> list[Finding]:
     prompts = [Prompt(tuple(roles.tokenizer(text)["input_ids"][:16]), text, {}) for text in WORDS]
     experience = gather(roles, prompts, 0, 0, 2)
     scores = Scores(np.linspace(-1, 1, 8), np.ones(8, bool), {}, {}, {})
-    rewards, _ = rewards_of(experience, scores, settings, settings.kl_beta)
-    batch = to_batch(experience, rewards, torch.ones(8, dtype=torch.bool), settings)
+    rewards = rewards_of(experience, scores, settings, settings.kl_beta).rewards
+    batch = batch_of(experience, rewards, torch.ones(8, dtype=torch.bool), settings)
     return [
         _same_logits(roles, experience),
         _same_policy(roles, experience),
@@ -74,7 +74,7 @@ def _same_logits(roles: Roles, experience: Experience) -> Finding:
     return Finding(
         "log-probabilities are those of model(tokens).logits", worst <= _limit(roles),
         f"largest gap {worst:.1e} nats a token",
-        "The model makes its logits otherwise than head(base(tokens)) times a factor. Report the model.",
+        "The model's logits are not head(base(tokens)) times a factor. Report the model.",
     )  # fmt: skip
 
 
@@ -83,8 +83,8 @@ def _same_policy(roles: Roles, experience: Experience) -> Finding:
     gap = float((experience.responses.logp - experience.logp)[mask].abs().max())
     return Finding(
         "sampling and training agree", gap <= _limit(roles), f"largest gap {gap:.1e} nats a token",
-        "The model computes other numbers with its KV cache than without. Update transformers, or report the "
-        "model.",
+        "The model computes different numbers with and without its KV cache. Update transformers, or report "
+        "the model.",
     )  # fmt: skip
 
 
@@ -209,7 +209,7 @@ def _critic(roles: Roles, batch: Batch, settings: AlignSettings) -> Finding:
 
 
 def _returns(experience: Experience, rewards: Tensor, batch: Batch) -> Finding:
-    """With lambda below 1 returns are not sums; A_t = sum_k lambda^k delta_{t+k}, summed here by hand."""
+    """With lambda below 1 returns are not sums; A_t = sum_k lambda^k delta_{t+k}, summed here directly."""
     settings, mask, worst = AlignSettings().update, experience.responses.mask, 0.0
     for row in range(len(mask)):
         length = int(mask[row].sum())

@@ -1,9 +1,10 @@
-"""The settings of the language story: one frozen dataclass a command, imported without torch."""
+"""The settings of the language story: one frozen dataclass per command, imported without torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.settings.fields import SCHEDULES, Schedule, fixed, of_update_rule, setting
@@ -129,13 +130,10 @@ class AlignSettings(ModelSettings):
     kl_beta: float = setting(0.05, "Weight of the KL to the reference; 0.02 to 0.2 is usual.", at_least=0)
     kl: str = setting(
         "k1-reward",
-        "Where the KL acts: in the reward (k1), exact and split, or in the loss alone.",
-        choices=(
-            "k1-reward", "exact-split", "k2-loss", "exact-loss",
-            "k2-reward", "k3-reward", "exact-reward", "k1-loss", "k3-loss",
-        ),
-    )  # fmt: skip
-    allow_biased_kl: bool = setting(False, "Accept a form of KL whose gradient is known to be wrong.")
+        "Where the KL acts: in the reward (k1), exact and split, or only in the loss.",
+        choices=("k1-reward", "exact-split", "k2-loss", "exact-loss"),
+    )
+    allow_biased_kl: bool = fixed(False)  # in settings.json of older runs
     kl_goal: float | None = setting(
         None, "Adapt kl_beta towards this KL per response, in nats (Ziegler: 6); none: fixed.", above=0
     )
@@ -188,7 +186,7 @@ class AlignSettings(ModelSettings):
         super().__post_init__()
         if self.batch_size % self.samples_per_prompt:
             raise ValueError(
-                f"batch_size {self.batch_size} is no multiple of samples_per_prompt "
+                f"batch_size {self.batch_size} is not a multiple of samples_per_prompt "
                 f"{self.samples_per_prompt}. Choose one that is."
             )
         if self.kl_goal is not None and not (self.kl_beta > 0 and self.kl_horizon > 0.2 * self.batch_size):
@@ -220,12 +218,6 @@ class AlignSettings(ModelSettings):
             raise ValueError(
                 "critic adapter needs the frozen trunk of --tune lora. With --tune full use head or separate."
             )
-        biased = self.kl not in ("k1-reward", "exact-split", "k2-loss", "exact-loss")
-        if biased and not self.allow_biased_kl:
-            raise ValueError(
-                f"kl {self.kl!r} has a gradient that is not the KL's. Use k1-reward or exact-split, or give "
-                "--allow-biased-kl to see what it does."
-            )
         if self.ptx_weight and self.ptx_data is None:
             raise ValueError("ptx_weight needs texts: give ptx_data, or ptx_weight 0.")
 
@@ -245,7 +237,7 @@ class AlignSettings(ModelSettings):
         return self.update.minibatch_size >= self.batch_size and self.update.micro_batch_size is None
 
     def risks(self) -> list[str]:
-        """What is unusual about these settings and why it is risky; training starts all the same."""
+        """What is unusual about these settings and why it is risky; training starts anyway."""
         found = []
         if self.kl_beta == 0 and self.kl_budget is None:
             found.append(
@@ -258,6 +250,24 @@ class AlignSettings(ModelSettings):
                 "Usual with tune full: 1e-6 to 1e-5 (tiny models stand more)."
             )
         return found
+
+
+AnySettings = TypeVar("AnySettings", bound=ModelSettings)
+
+
+def recorded(settings: AnySettings, **given: Any) -> AnySettings:
+    """The settings that settings.json keeps of what was given in Python: paths are stored as text. Of an
+    object only its name is, in angle brackets, so that nobody takes it for a file, a folder or a reward.
+    None keeps the setting.
+    """
+    names: dict[str, Any] = {
+        name: str(value)
+        if isinstance(value, str | Path)
+        else f"<{getattr(value, '__name__', type(value).__name__).strip('<>')}>"
+        for name, value in given.items()
+        if value is not None
+    }
+    return settings.with_values(**names)
 
 
 class Recipe(NamedTuple):

@@ -1,1 +1,3 @@
-"""The mathematics: pure functions of [B, T] tensors that import torch alone; only `statistics` reduces."""
+"""The mathematics: pure functions of [B, T] tensors that import only torch; only `statistics` reduces."""
+
+__all__ = ["divergence", "returns", "statistics", "surrogate", "values"]

@@ -3,9 +3,8 @@
 k1, k2, k3 estimate KL(old || new) from steps sampled by the OLD policy, with log_ratio = log(new / old) at
 the sampled action: [B, T] in, [B, T] out. Source: Schulman, http://joschu.net/blog/kl-approx.html
 
-Entropies take the parameters of distributions, [..., d] in and [...] out: the action axis, the last one,
-alone is summed. A masked choice has the logit -inf; it contributes 0 to every sum, without NaN in value or
-gradient.
+Entropies take the parameters of distributions, [..., d] in and [...] out: only the action axis, the last one,
+is summed. A masked choice has the logit -inf; it adds 0 to every sum, without NaN in value or gradient.
 """
 
 from math import log, pi

@@ -89,8 +89,8 @@ def discounted_returns(
     """Discounted sums of the rewards to come, [B, T].
 
     G_t = r_t + gamma * G_{t+1}; where `ended` and in the last column G_t = r_t + gamma * bootstrap_t; 0 where
-    masked, and a masked step hands nothing back. `bootstrap` [B, T] is the value of the state after the step
-    and is read at those cuts alone: give 0 where the step terminated, V(s_{t+1}) where it was truncated or
+    masked, and a masked step passes nothing back. `bootstrap` [B, T] is the value of the state after the step
+    and is read only at those cuts: give 0 where the step terminated, V(s_{t+1}) where it was truncated or
     cut. None means 0 everywhere. ValueError when the shapes differ.
     """
     require_same_shape(rewards=rewards, ended=ended, bootstrap=bootstrap, mask=mask)
@@ -105,19 +105,3 @@ def discounted_returns(
             future = torch.where(mask[:, t], future, 0.0)
         returns.append(future)
     return torch.stack(returns[::-1], dim=1)
-
-
-def next_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values: Tensor) -> Tensor:
-    """V of the true next observation of every step, [B, T].
-
-    V(s_{t+1}) is values_{t+1}, and `last_values` [B] after the last column; where `ended` the next column
-    belongs to another episode, and `final_values` [B, T] (V of the last observation of the episode) stands
-    there instead. What `final_values` holds elsewhere is not read; where the step terminated any number will
-    do, `td_errors` drops it. ValueError when the shapes differ.
-    """
-    require_same_shape(values=values, ended=ended, final_values=final_values)
-    if not values.shape[1]:
-        return values
-    require_same_shape(values_of_a_column=values[:, 0], last_values=last_values)
-    shifted = torch.cat([values[:, 1:], last_values[:, None]], dim=1)
-    return torch.where(ended, final_values, shifted)

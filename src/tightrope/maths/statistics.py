@@ -21,9 +21,9 @@ def masked_mean(x: Tensor, mask: Tensor, count: float | Tensor | None = None) ->
     """sum(x where mask) / count, a scalar.
 
     `count` is the number of counting steps of the WHOLE minibatch: with it the results of micro-batches and
-    ranks add up to the mean, and their gradients to its gradient. None counts the mask at hand; an empty one
-    then gives 0, as a part without counting steps adds nothing (dividing by 0 would turn it, and all it is
-    added to, into NaN). ValueError when the shapes differ, or when a given number is not above 0.
+    ranks add up to the mean, and their gradients to its gradient. None counts this mask; an empty one then
+    gives 0: a part without counting steps adds nothing, and a division by 0 would make every sum NaN.
+    ValueError when the shapes differ, or when a given number is not above 0.
     """
     if count is None:
         count = mask.sum().clamp(min=1)
@@ -35,7 +35,7 @@ def masked_mean(x: Tensor, mask: Tensor, count: float | Tensor | None = None) ->
 def masked_variance(x: Tensor, mask: Tensor, count: float | Tensor | None = None) -> Tensor:
     """Population variance, sum((x - mean)^2 where mask) / count, a scalar in squared units of x.
 
-    The mean is that of the steps at hand. `count` replaces their number as the divisor (their number minus 1
+    The mean is that of the given steps. `count` replaces their number as the divisor (their number minus 1
     gives the sample variance); unlike the mean, the variances of parts do not add up. An empty mask gives 0.
     ValueError as in `masked_mean`.
     """

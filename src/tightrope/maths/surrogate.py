@@ -76,11 +76,7 @@ def policy_gradient(logp: Tensor, advantages: Tensor, mask: Tensor | None = None
     return -logp * advantages
 
 
-def clipped_high(log_ratio: Tensor, clip_high: float) -> Tensor:
-    """True where r > 1 + clip_high, whatever the sign of the advantage; bool [B, T]."""
-    return log_ratio.detach().exp() > 1 + clip_high
-
-
-def clipped_low(log_ratio: Tensor, clip: float) -> Tensor:
-    """True where r < 1 - clip, whatever the sign of the advantage; bool [B, T]."""
-    return log_ratio.detach().exp() < 1 - clip
+def clipped(log_ratio: Tensor, clip: float, clip_high: float) -> tuple[Tensor, Tensor]:
+    """Where r > 1 + clip_high, and where r < 1 - clip, whatever the sign of the advantage; bool [B, T]."""
+    ratio = log_ratio.detach().exp()
+    return ratio > 1 + clip_high, ratio < 1 - clip

@@ -67,17 +67,17 @@ def make_masks(layout, rows, rng):
 def make_batch(policy, rows=8, steps=40, seed=2, masked=False, action_masks=False, drift=0.15):
     """A batch sampled from the policy, whose old_logp is ``drift`` off, so that clips happen."""
     rng, shape, count = np.random.default_rng(seed), (rows, steps), rows * steps
-    inputs = {"flat": torch.from_numpy(rng.standard_normal((count, FEATURES), dtype=np.float32))}
+    inputs = {"flat": rng.standard_normal((count, FEATURES), dtype=np.float32)}
     if action_masks:
-        inputs["action_mask"] = torch.from_numpy(make_masks(policy.layout, count, rng))
-    actions, logp = policy.act(inputs, torch.from_numpy(make_noise(policy.layout, count, rng)))
+        inputs["action_mask"] = make_masks(policy.layout, count, rng)
+    actions, logp = policy.act(inputs, make_noise(policy.layout, count, rng))
 
     def normal():
         return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
 
     values, advantages = normal(), normal()
     return Batch(
-        inputs={name: x.reshape(*shape, -1) for name, x in inputs.items()},
+        inputs={name: torch.from_numpy(x).reshape(*shape, -1) for name, x in inputs.items()},
         actions=actions.reshape(*shape, -1),
         old_logp=logp.reshape(shape) + drift * normal(),
         old_values=values,

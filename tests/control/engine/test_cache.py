@@ -29,7 +29,7 @@ def memory():
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 before = memory()
-from tightrope.control.engine.compiled_engine import FusedEngine
+from tightrope.control.engine.compiled_engine import CompiledEngine
 from tightrope.control.engine.compiled import infer
 needed = memory() - before
 import engine_cases
@@ -38,7 +38,7 @@ no, yes, out = np.zeros(x.shape, bool), np.ones(x.shape, bool), np.empty_like(x)
 infer.gae_batch(x, x + 1, x + 2, no, no, yes, 0.99, 0.95, out)
 policy, optimiser, settings = engine_cases.make()
 batch, rng = engine_cases.make_batch(policy), np.random.default_rng(0)
-metrics = FusedEngine(policy, optimiser, 1).update(policy, optimiser, batch, settings, rng)
+metrics = CompiledEngine(policy, optimiser, 1).update(batch, settings, rng)
 weights = [p.detach().numpy().tobytes() for p in policy.parameters()]
 result = hashlib.sha256(b"".join([out.tobytes(), repr(metrics).encode(), *weights]))
 print(result.hexdigest(), needed, *sorted(sys.modules))

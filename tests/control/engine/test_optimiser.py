@@ -7,7 +7,7 @@ import torch
 from engine_cases import difference, make, make_batch, numbers
 
 from tightrope.algorithms import ppo
-from tightrope.control.engine.compiled_engine import FusedEngine
+from tightrope.control.engine.compiled_engine import CompiledEngine
 
 
 def rng(seed):
@@ -17,14 +17,14 @@ def rng(seed):
 def test_continuing_on_torch_equals_continuing_fused():
     policy, optimiser, settings = make("mixed")
     batch = make_batch(policy)
-    engine = FusedEngine(policy, optimiser, 1)
-    engine.update(policy, optimiser, batch, settings, rng(0))
+    engine = CompiledEngine(policy, optimiser, 1)
+    engine.update(batch, settings, rng(0))
     state = copy.deepcopy((policy.state_dict(), optimiser.state_dict()))
     other, other_optimiser, _ = make("mixed", seed=7)
     other.load_state_dict(state[0])
     other_optimiser.load_state_dict(state[1])
     ppo.update(other, other_optimiser, batch.as_steps(), settings, rng(1))
-    engine.update(policy, optimiser, batch, settings, rng(1))
+    engine.update(batch, settings, rng(1))
     assert difference(numbers(policy), numbers(other)) < 1e-5
 
 
@@ -33,18 +33,18 @@ def test_the_engine_takes_over_torchs_moments_and_a_loaded_state():
     batch = make_batch(policy)
     ppo.update(policy, optimiser, batch.as_steps(), settings, rng(0))
     state = copy.deepcopy((policy.state_dict(), optimiser.state_dict()))
-    engine = FusedEngine(policy, optimiser, 1)
-    engine.update(policy, optimiser, batch, settings, rng(1))
+    engine = CompiledEngine(policy, optimiser, 1)
+    engine.update(batch, settings, rng(1))
     expected = numbers(policy)
     policy.load_state_dict(state[0])
     optimiser.load_state_dict(state[1])  # replaces the tensors of the state: the engine must find them again
-    engine.update(policy, optimiser, batch, settings, rng(1))
+    engine.update(batch, settings, rng(1))
     assert difference(expected, numbers(policy)) == 0.0
 
 
 def test_state_dicts_have_torchs_form():
     policy, optimiser, settings = make("box")
-    FusedEngine(policy, optimiser, 1).update(policy, optimiser, make_batch(policy), settings, rng(0))
+    CompiledEngine(policy, optimiser, 1).update(make_batch(policy), settings, rng(0))
     state = optimiser.state_dict()["state"]
     assert len(state) == len(list(policy.parameters()))
     ordered = [p for group in optimiser.param_groups for p in group["params"]]
@@ -57,17 +57,17 @@ def test_state_dicts_have_torchs_form():
 
 def test_schedules_reach_the_engine_through_the_optimisers_groups():
     policy, optimiser, settings = make()
-    before, engine = numbers(policy), FusedEngine(policy, optimiser, 1)
+    before, engine = numbers(policy), CompiledEngine(policy, optimiser, 1)
     for group in optimiser.param_groups:
         group["lr"] = 0.0
-    engine.update(policy, optimiser, make_batch(policy), settings, rng(0))
+    engine.update(make_batch(policy), settings, rng(0))
     assert difference(before, numbers(policy)) == 0.0
 
 
 def test_parameters_that_were_replaced_are_found_again():
     policy, optimiser, settings = make()
-    engine, batch = FusedEngine(policy, optimiser, 1), make_batch(policy)
+    engine, batch = CompiledEngine(policy, optimiser, 1), make_batch(policy)
     first = policy.actor[0].weight
     first.data = torch.zeros_like(first)
-    engine.update(policy, optimiser, batch, settings, rng(0))
+    engine.update(batch, settings, rng(0))
     assert float(first.detach().abs().max()) > 0

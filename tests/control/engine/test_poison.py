@@ -8,17 +8,18 @@ import pytest
 import torch
 from engine_cases import difference, make, make_batch, numbers
 
-from tightrope.algorithms.optimise import NonFiniteError, SamplingMismatch
-from tightrope.control.engine.compiled_engine import FusedEngine
+from tightrope.algorithms.descent import SamplingMismatch
+from tightrope.algorithms.nonfinite import NonFiniteError
+from tightrope.control.engine.compiled_engine import CompiledEngine
 
 
 def refuse(policy, optimiser, settings, batch, threads):
     """Update and expect the refusal; returns its text and whether weights and moments are as before."""
-    engine = FusedEngine(policy, optimiser, threads)
+    engine = CompiledEngine(policy, optimiser, threads)
     before = numbers(policy)
     moments = [s[k].clone() for s in optimiser.state.values() for k in ("exp_avg", "exp_avg_sq", "step")]
     with pytest.raises(NonFiniteError) as caught:
-        engine.update(policy, optimiser, batch, settings, np.random.default_rng(0))
+        engine.update(batch, settings, np.random.default_rng(0))
     after = [s[k] for s in optimiser.state.values() for k in ("exp_avg", "exp_avg_sq", "step")]
     assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(moments, after, strict=True))
     same = all(
@@ -83,9 +84,9 @@ def test_later_minibatches_are_caught_after_the_steps_before_them():
     batch = make_batch(policy)
     order = np.random.default_rng(0).permutation(320)
     batch.returns.view(-1)[order[16 * 7]] = torch.nan
-    engine = FusedEngine(policy, optimiser, 2)
+    engine = CompiledEngine(policy, optimiser, 2)
     with pytest.raises(NonFiniteError, match="minibatch 8 of epoch 1"):
-        engine.update(policy, optimiser, batch, settings, np.random.default_rng(0))
+        engine.update(batch, settings, np.random.default_rng(0))
     assert float(optimiser.state[policy.actor[0].weight]["step"]) == 7
     assert all(torch.isfinite(p).all() for p in policy.parameters())
     engine.close()
@@ -96,27 +97,25 @@ def test_masked_steps_may_hold_anything():
     batch = make_batch(policy, masked=True)
     for tensor in (batch.inputs["flat"], batch.old_logp, batch.advantages, batch.returns, batch.actions):
         tensor[~batch.mask] = torch.nan
-    FusedEngine(policy, optimiser, 1).update(policy, optimiser, batch, settings, np.random.default_rng(0))
+    CompiledEngine(policy, optimiser, 1).update(batch, settings, np.random.default_rng(0))
     assert all(torch.isfinite(p).all() for p in policy.parameters())
 
 
 def test_first_ratios_off_one_are_refused_before_any_step():
     policy, optimiser, settings = make()
     before, batch = numbers(policy), make_batch(policy, drift=0.0)
-    engine = FusedEngine(policy, optimiser, 1)
+    engine = CompiledEngine(policy, optimiser, 1)
     batch = dataclasses.replace(batch, old_logp=batch.old_logp + 0.01)
     with pytest.raises(SamplingMismatch, match="differ by 0"):
-        engine.update(policy, optimiser, batch, settings, np.random.default_rng(0), log_ratio_limit=1e-5)
+        engine.update(batch, settings, np.random.default_rng(0), log_ratio_limit=1e-5)
     assert difference(before, numbers(policy)) == 0.0
 
 
 def test_what_is_sampled_is_what_is_trained():
     policy, optimiser, settings = make("mixed")
     batch = make_batch(policy, drift=0.0)
-    engine = FusedEngine(policy, optimiser, 1)
-    metrics = engine.update(
-        policy, optimiser, batch, settings, np.random.default_rng(0), log_ratio_limit=1e-5
-    )
+    engine = CompiledEngine(policy, optimiser, 1)
+    metrics = engine.update(batch, settings, np.random.default_rng(0), log_ratio_limit=1e-5)
     assert metrics["train/log_ratio_first"] <= 1e-5
 
 

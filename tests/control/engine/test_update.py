@@ -14,7 +14,7 @@ from engine_cases import SPACES, difference, make, make_batch, numbers
 from tightrope.algorithms import ppo
 from tightrope.control.engine.compiled.plan import unsupported
 from tightrope.control.engine.compiled.threads import LEFT
-from tightrope.control.engine.compiled_engine import FusedEngine
+from tightrope.control.engine.compiled_engine import CompiledEngine
 
 SETTINGS = {
     "defaults": {},
@@ -50,12 +50,12 @@ def both(space="discrete", threads=1, updates=2, batch=None, **values):
     data = make_batch(policy, **(batch or {}))
     assert unsupported(policy, settings, policy.device, "ppo") is None
     twin = copy.deepcopy((policy, optimiser))
-    engine = FusedEngine(*twin, threads)
+    engine = CompiledEngine(*twin, threads)
     metrics = []
     for seed in range(updates):
         metrics = [
             ppo.update(policy, optimiser, data.as_steps(), settings, np.random.default_rng(seed)),
-            engine.update(*twin, data, settings, np.random.default_rng(seed)),
+            engine.update(data, settings, np.random.default_rng(seed)),
         ]
     engine.close()
     return metrics, numbers(policy), numbers(twin[0])
@@ -95,7 +95,7 @@ def test_kl_stop_leaves_the_generator_where_torch_leaves_it():
     data, twin = make_batch(policy, drift=0.0), copy.deepcopy((policy, optimiser))
     first, second = np.random.default_rng(0), np.random.default_rng(0)
     ppo.update(policy, optimiser, data.as_steps(), settings, first)
-    FusedEngine(*twin, 1).update(*twin, data, settings, second)
+    CompiledEngine(*twin, 1).update(data, settings, second)
     assert first.random() == second.random()
 
 
@@ -111,10 +111,10 @@ def test_bits_do_not_depend_on_the_number_of_threads(space, values):
 
 def fused(threads, start=None):
     policy, optimiser, settings = make("mixed")
-    engine = FusedEngine(policy, optimiser, threads)
+    engine = CompiledEngine(policy, optimiser, threads)
     if start is not None:
         engine._helper.start = start(engine._helper.start)
-    metrics = engine.update(policy, optimiser, make_batch(policy), settings, np.random.default_rng(0))
+    metrics = engine.update(make_batch(policy), settings, np.random.default_rng(0))
     engine.close()
     return numbers(policy), metrics
 
@@ -147,7 +147,7 @@ def test_a_lost_helper_changes_nothing(start):
 
 def test_an_interrupt_between_epochs_releases_the_helper():
     policy, optimiser, settings = make()
-    engine = FusedEngine(policy, optimiser, 2)
+    engine = CompiledEngine(policy, optimiser, 2)
 
     class Interrupted:
         calls = 0
@@ -160,29 +160,26 @@ def test_an_interrupt_between_epochs_releases_the_helper():
 
     batch = make_batch(policy)
     with pytest.raises(KeyboardInterrupt):
-        engine.update(policy, optimiser, batch, settings, Interrupted())
-    engine.update(policy, optimiser, batch, settings, np.random.default_rng(0))
+        engine.update(batch, settings, Interrupted())
+    engine.update(batch, settings, np.random.default_rng(0))
     engine.close()
 
 
 def test_first_minibatch_check_sees_no_difference_and_changes_nothing():
     policy, optimiser, settings = make("mixed")
-    engine, batch = FusedEngine(policy, optimiser, 1), make_batch(policy)
+    engine, batch = CompiledEngine(policy, optimiser, 1), make_batch(policy)
     before = numbers(policy)
     assert engine.check_first_minibatch(batch, settings) < 1e-6
     assert difference(before, numbers(policy)) == 0.0
 
 
-def test_what_the_engine_does_not_know_and_a_batch_without_a_step_are_refused():
+def test_a_batch_without_a_step_is_refused():
     policy, optimiser, settings = make()
-    engine, batch = FusedEngine(policy, optimiser, 1), make_batch(policy)
+    engine, batch = CompiledEngine(policy, optimiser, 1), make_batch(policy)
     before, rng = numbers(policy), np.random.default_rng(0)
-    for name in ("extra_loss", "draw"):
-        with pytest.raises(ValueError, match="extra_loss, draw, recompute_advantages"):
-            engine.update(policy, optimiser, batch, settings, rng, **{name: lambda x: x})
     nothing = dataclasses.replace(batch, mask=batch.mask & False)
     with pytest.raises(ValueError, match="No step of the batch counts"):
-        engine.update(policy, optimiser, nothing, settings, rng)
+        engine.update(nothing, settings, rng)
     assert difference(before, numbers(policy)) == 0.0
     engine.close()
 
@@ -201,10 +198,10 @@ def test_the_process_ends_cleanly_right_after_an_update_with_two_threads():
     lines = [
         "import numpy as np",
         "from engine_cases import make, make_batch",
-        "from tightrope.control.engine.compiled_engine import FusedEngine",
+        "from tightrope.control.engine.compiled_engine import CompiledEngine",
         "policy, optimiser, settings = make()",
-        "engine = FusedEngine(policy, optimiser, 2)",
-        "engine.update(policy, optimiser, make_batch(policy), settings, np.random.default_rng(0))",
+        "engine = CompiledEngine(policy, optimiser, 2)",
+        "engine.update(make_batch(policy), settings, np.random.default_rng(0))",
     ]
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     ended = subprocess.run(

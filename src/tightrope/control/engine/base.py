@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -13,8 +13,8 @@ from threadpoolctl import ThreadpoolController
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import UpdateSettings
 from tightrope.control.policy.normalise import ObservationNormaliser
+from tightrope.control.spaces import Array, Inputs
 
-Array = np.ndarray
 _controller: ThreadpoolController | None = None
 
 
@@ -24,13 +24,24 @@ class Acted(NamedTuple):
     The caller provides them because the compiled engine writes in place, which saves a copy.
     """
 
-    inputs: dict[str, Array]  # [N, ...]: the observations as the policy saw them (normalised)
+    inputs: Inputs  # [N, ...]: the observations as the policy saw them (normalised)
     actions: Array  # float32 [N, A]
     logp: Array  # float32 [N]: log-probability of these actions
 
 
+class Steps(NamedTuple):
+    """What advantages are computed from (see maths.returns): float32 and bool arrays [B, T]."""
+
+    rewards: Array
+    values: Array
+    next_values: Array
+    terminated: Array
+    ended: Array
+    mask: Array
+
+
 class Engine(Protocol):
-    """What computes: acting, values, advantages and updates. Torch is the reference."""
+    """What computes: acting, values, advantages and updates of one policy. Torch is the reference."""
 
     @property
     def name(self) -> str:
@@ -49,7 +60,7 @@ class Engine(Protocol):
 
     def act(
         self,
-        inputs: dict[str, Array],
+        inputs: Inputs,
         normaliser: ObservationNormaliser | None,
         action_mask: Array | None,
         noise: Array,
@@ -61,35 +72,23 @@ class Engine(Protocol):
         ``action_mask`` bool [B, L]. ``noise`` [B, A]: uniform for categories and bits, normal for Gaussians.
         """
 
-    def values(self, inputs: dict[str, Array]) -> Array:
+    def values(self, inputs: Inputs) -> Array:
         """Values [N] of encoded observations [N, ...]."""
 
-    def gae(
-        self,
-        rewards: Array,
-        values: Array,
-        next_values: Array,
-        terminated: Array,
-        ended: Array,
-        mask: Array,
-        gamma: float,
-        gae_lambda: float,
-    ) -> Array:
+    def gae(self, steps: Steps, gamma: float, gae_lambda: float) -> Array:
         """Advantages [B, T] float32: maths.returns.gae on arrays."""
 
     def update(
         self,
-        optimiser: torch.optim.Optimizer,
         batch: Batch,
         settings: UpdateSettings,
         rng: np.random.Generator,
-        **more: Any,
+        *,
+        refresh: Callable[[Batch], Batch] | None = None,
+        log_ratio_limit: float | None = None,
     ) -> dict[str, float]:
-        """The algorithm's update."""
-
-    def check(self, batch: Batch, settings: UpdateSettings) -> str:
-        """Compare one minibatch with the reference: a line for the user, empty when there is nothing to
-        compare. RuntimeError when they differ.
+        """The algorithm's update. ``log_ratio_limit`` is given for the first one of a run, in which the
+        compiled engine is compared with the reference; RuntimeError when they differ.
         """
 
     def close(self) -> None:
@@ -98,7 +97,7 @@ class Engine(Protocol):
 
 @contextmanager
 def limited_threads(threads: int) -> Iterator[None]:
-    """Torch and BLAS use at most ``threads`` threads inside; the user's own numbers return afterwards.
+    """Torch and BLAS use at most ``threads`` threads inside; the numbers from before return afterwards.
 
     A minibatch of 64 rows is too small to share, and idle BLAS threads spin.
     """

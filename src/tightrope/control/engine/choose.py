@@ -23,7 +23,7 @@ def usable_device(name: str) -> torch.device:
     return device
 
 
-def choose(
+def choose_engine(
     policy: Policy,
     optimiser: torch.optim.Optimizer,
     settings: TrainSettings,
@@ -35,7 +35,7 @@ def choose(
     Raises ValueError when ``engine`` is ``fused`` and the compiled engine does not cover the settings.
     """
     if settings.engine == "torch":
-        return TorchEngine(policy, settings), "engine: torch, as asked"
+        return TorchEngine(policy, optimiser, settings), "engine: torch, as asked"
     from tightrope.control.engine.compiled.plan import unsupported
 
     reason = unsupported(policy, settings.update, policy.device, settings.algorithm)
@@ -48,11 +48,12 @@ def choose(
             notify(f"compiling the CPU engine: about 15 seconds, {when_compiled()} ...")
         from tightrope.control.engine.compiled_engine import CompiledEngine
 
-        engine = CompiledEngine(policy, optimiser, threads=min(2, cores))
+        engine = CompiledEngine(policy, optimiser, min(2, cores), notify)
         return engine, "engine: fused (compiled for this CPU)"
     if settings.engine == "fused":
         raise ValueError(
             f"engine is 'fused', which does not cover {reason}. Use --engine auto or torch, or change that "
             "setting."
         )
-    return TorchEngine(policy, settings), f"engine: torch (the compiled engine does not cover {reason})"
+    line = f"engine: torch (the compiled engine does not cover {reason})"
+    return TorchEngine(policy, optimiser, settings), line

@@ -6,21 +6,21 @@ import copy
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.descent import check_first_ratios
 from tightrope.algorithms.nonfinite import NonFiniteError, explain
-from tightrope.algorithms.optimise import check_first_ratios
 from tightrope.algorithms.settings import PPOSettings, UpdateSettings
-from tightrope.control.engine.base import Acted, Array
+from tightrope.control.engine.base import Acted, Steps
 from tightrope.control.engine.compiled import cache, infer, plan, threads
 from tightrope.control.engine.compiled import update as kernels
 from tightrope.control.policy.normalise import CLIP, ObservationNormaliser
 from tightrope.control.policy.policy import Policy
+from tightrope.control.spaces import Array, Inputs
 
 cache.mark_complete()  # importing infer and update has compiled or loaded every entry
 
@@ -34,86 +34,24 @@ SMOOTH = {"lr": 1.0, "eps": 1.0}
 
 
 class CompiledEngine:
-    """See Engine. It works on the memory of the torch parameters and of torch's Adam."""
+    """See Engine: the compiled execution of ``ppo.update`` for one policy and its torch.optim.Adam.
+
+    Both remain torch objects: every parameter, and every moment of Adam, is a view of flat memory that the
+    engine works on. ``num_threads`` 2: actor and critic on a core each, unless they share a trunk; the bits
+    are those of 1. ``notify`` gets a line about the comparison with ppo.py.
+    """
 
     name = "fused"
     device = torch.device("cpu")
 
-    def __init__(self, policy: Policy, optimiser: torch.optim.Optimizer, threads: int) -> None:
-        self.policy = policy
-        self.fused = FusedEngine(policy, optimiser, threads)
-        self.gae = self.fused.gae
-
-    def begin_rollout(self, num_envs: int, rng: np.random.Generator) -> None:
-        """Attach to parameters whose memory was replaced since the last update."""
-        self.fused.attach()
-
-    def act(
+    def __init__(
         self,
-        inputs: dict[str, Array],
-        normaliser: ObservationNormaliser | None,
-        action_mask: Array | None,
-        noise: Array,
-        rows: slice,
-        out: Acted,
-    ) -> None:
-        """See Engine."""
-        mean, inverse_std = (None, None) if normaliser is None else (normaliser.mean, normaliser.inverse_std)
-        mask = None
-        if action_mask is not None:
-            mask = action_mask[rows]
-            out.inputs["action_mask"][:] = mask
-        flat = inputs["flat"][rows]
-        self.fused.act(
-            flat, mean, inverse_std, CLIP, mask, noise[rows], out.actions, out.logp, out.inputs["flat"]
-        )
-
-    def values(self, inputs: dict[str, Array]) -> Array:
-        """See Engine."""
-        return self.fused.values(inputs["flat"])
-
-    def update(
-        self,
+        policy: Policy,
         optimiser: torch.optim.Optimizer,
-        batch: Batch,
-        settings: UpdateSettings,
-        rng: np.random.Generator,
-        **more: Any,
-    ) -> dict[str, float]:
-        """ppo.update, compiled."""
-        assert isinstance(settings, PPOSettings)
-        return self.fused.update(self.policy, optimiser, batch, settings, rng, **more)
-
-    def check(self, batch: Batch, settings: UpdateSettings) -> str:
-        """Compare one minibatch with ppo.py, on copies: a line with the largest difference of a parameter.
-
-        Raises RuntimeError when the difference is above CHECK_LIMIT.
-        """
-        assert isinstance(settings, PPOSettings)
-        difference = self.fused.check_first_minibatch(batch, settings)
-        if not difference <= CHECK_LIMIT:
-            raise RuntimeError(
-                f"After one minibatch the compiled engine differs from ppo.py by {difference:.2g} in a "
-                f"parameter (limit {CHECK_LIMIT:g}). Train with --engine torch, and please report this with "
-                "your settings.json."
-            )
-        return f"engine check: one minibatch by ppo.py and compiled, largest difference {difference:.1e}"
-
-    def close(self) -> None:
-        """End the helping thread."""
-        self.fused.close()
-
-
-class FusedEngine:
-    """The compiled execution of ``ppo.update`` for one policy and its optimiser (torch.optim.Adam).
-
-    Both remain torch objects: every parameter, and every moment of Adam, is a view of flat memory that the
-    engine works on. ``num_threads`` 2: actor and critic on a core each, unless they share a trunk; the bits
-    are those of 1.
-    """
-
-    def __init__(self, policy: Any, optimiser: torch.optim.Optimizer, num_threads: int) -> None:
-        self.policy, self.optimiser = policy, optimiser
+        num_threads: int,
+        notify: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self.policy, self.optimiser, self.notify = policy, optimiser, notify
         self._plan = plan.make_plan(policy)
         self._flat, self._grad = plan.aligned_zeros(self._plan.size), plan.aligned_zeros(self._plan.size)
         self._moment, self._square = plan.aligned_zeros(self._plan.size), plan.aligned_zeros(self._plan.size)
@@ -164,51 +102,43 @@ class FusedEngine:
 
     # --- rollout
 
+    def begin_rollout(self, num_envs: int, rng: np.random.Generator) -> None:
+        """Attach to parameters whose memory was replaced since the last update."""
+        self.attach()
+
     def act(
         self,
-        flat: Array,
-        mean: Array | None,
-        inverse_std: Array | None,
-        clip: float,
+        inputs: Inputs,
+        normaliser: ObservationNormaliser | None,
         action_mask: Array | None,
         noise: Array,
-        actions_out: Array,
-        logp_out: Array,
-        inputs_out: Array,
+        rows: slice,
+        out: Acted,
     ) -> None:
-        """Act on raw observations [B, D] float32; fills actions [B, A], logp [B] and normalised inputs [B,
-        D].
-
-        ``mean`` None: no normalisation. ``noise`` [B, A]: uniforms for categories and bits, normals for
-        Gaussians. The three outputs may be strided columns of a rollout.
-        """
-        p, masks = self._plan, _NO_MASK if action_mask is None else action_mask
-        mean, inverse_std = (_NOTHING, _NOTHING) if mean is None else (mean, inverse_std)
+        """See Engine. The arrays of ``out`` may be strided columns of a rollout."""
+        p, masks = self._plan, _NO_MASK
+        if action_mask is not None:
+            masks = action_mask[rows]
+            out.inputs["action_mask"][:] = masks
+        mean, inverse_std = _NOTHING, _NOTHING
+        if normaliser is not None:
+            mean, inverse_std = normaliser.mean, normaliser.inverse_std
         infer.act_batch(
-            p.places, p.layers, p.components, self._flat, self._work[0], flat, mean, inverse_std, clip, masks,
-            noise, actions_out, logp_out, inputs_out,
+            p.places, p.layers, p.components, self._flat, self._work[0], inputs["flat"][rows], mean,
+            inverse_std, CLIP, masks, noise[rows], out.actions, out.logp, out.inputs["flat"],
         )  # fmt: skip
 
-    def values(self, flat: Array) -> Array:
-        """Values [N] float32 of inputs [N, D], already normalised."""
+    def values(self, inputs: Inputs) -> Array:
+        """See Engine."""
+        flat = _float(inputs["flat"])
         out = np.empty(len(flat), np.float32)
-        infer.value_batch(self._plan.places, self._plan.layers, self._flat, self._work[0], _float(flat), out)
+        infer.value_batch(self._plan.places, self._plan.layers, self._flat, self._work[0], flat, out)
         return out
 
-    def gae(
-        self,
-        rewards: Array,
-        values: Array,
-        next_values: Array,
-        terminated: Array,
-        ended: Array,
-        mask: Array,
-        gamma: float,
-        gae_lambda: float,
-    ) -> Array:
-        """Advantages [B, T] float32: maths.returns.gae."""
-        numbers = [_float(x) for x in (rewards, values, next_values)]
-        flags = [np.ascontiguousarray(x, bool) for x in (terminated, ended, mask)]
+    def gae(self, steps: Steps, gamma: float, gae_lambda: float) -> Array:
+        """See Engine. ValueError when the shapes differ: compiled code does not look."""
+        numbers = [_float(x) for x in steps[:3]]
+        flags = [np.ascontiguousarray(x, bool) for x in steps[3:]]
         out = np.empty(numbers[0].shape, np.float32)
         if any(x.shape != out.shape for x in (*numbers, *flags)):
             raise ValueError(
@@ -221,26 +151,22 @@ class FusedEngine:
 
     def update(
         self,
-        model: Any,
-        optimiser: torch.optim.Optimizer,
         batch: Batch,
-        settings: PPOSettings,
+        settings: UpdateSettings,
         rng: np.random.Generator,
         *,
-        extra_loss: Any = None,
-        draw: Any = None,
-        refresh: Any = None,
+        refresh: Callable[[Batch], Batch] | None = None,
         log_ratio_limit: float | None = None,
     ) -> dict[str, float]:
-        """``ppo.update``: same permutations, metrics and errors; parameters equal within 1e-5."""
-        if model is not self.policy or optimiser is not self.optimiser:
-            raise ValueError("This engine was made for another policy or optimiser; make one for these.")
-        if extra_loss is not None or draw is not None or settings.recompute_advantages:
-            raise ValueError(
-                "The compiled engine does not support extra_loss, draw, recompute_advantages; use ppo.update."
-            )
+        """``ppo.update``: same permutations, metrics and errors; parameters equal within 1e-5.
+
+        ``refresh`` is not needed: `plan.unsupported` refuses recompute_advantages.
+        """
+        assert isinstance(settings, PPOSettings)
         batch.require_steps()
         self.attach()
+        if log_ratio_limit is not None:
+            self._check(batch, settings)
         rows, columns = _rows(batch), _columns(batch)
         run = _Run(self, columns, self._options(settings, log_ratio_limit))
         began, together = time.perf_counter(), self._choice.choose()
@@ -293,6 +219,19 @@ class FusedEngine:
         options[k.STEPS_BEFORE] = self._steps[0]
         return options
 
+    def _check(self, batch: Batch, settings: PPOSettings) -> None:
+        """Compare one minibatch with ppo.py. RuntimeError when a parameter differs by over CHECK_LIMIT."""
+        difference = self.check_first_minibatch(batch, settings)
+        if not difference <= CHECK_LIMIT:
+            raise RuntimeError(
+                f"After one minibatch the compiled engine differs from ppo.py by {difference:.2g} in a "
+                f"parameter (limit {CHECK_LIMIT:g}). Train with --engine torch, and please report this with "
+                "your settings.json."
+            )
+        self.notify(
+            f"engine check: one minibatch by ppo.py and compiled, largest difference {difference:.1e}"
+        )
+
     def check_first_minibatch(self, batch: Batch, settings: PPOSettings) -> float:
         """Largest difference between a parameter after one step of ppo.update and after one of this engine.
 
@@ -301,27 +240,21 @@ class FusedEngine:
         """
         steps = batch.as_steps().select(slice(0, settings.minibatch_size))
         once = dataclasses.replace(settings, num_epochs=1)
-        results = []
-        for compute in (self._with_torch, self._with_engine):
-            policy, optimiser = copy.deepcopy((self.policy, self.optimiser))
+        pairs = [copy.deepcopy((self.policy, self.optimiser)) for _ in range(2)]
+        for _, optimiser in pairs:
             for group in optimiser.param_groups:
                 group.update(SMOOTH)
-            compute(policy, optimiser, steps, once)
-            results.append([p.detach() for p in policy.parameters()])
-        return max(float((a - b).abs().max()) for a, b in zip(*results, strict=True))
-
-    @staticmethod
-    def _with_torch(policy: Any, optimiser: Any, batch: Batch, settings: PPOSettings) -> None:
-        ppo.update(policy, optimiser, batch, settings, np.random.default_rng(0))
-
-    def _with_engine(self, policy: Any, optimiser: Any, batch: Batch, settings: PPOSettings) -> None:
-        FusedEngine(policy, optimiser, 1).update(policy, optimiser, batch, settings, np.random.default_rng(0))
+        (expected, first), (found, second) = pairs
+        ppo.update(expected, first, steps, once, np.random.default_rng(0))
+        CompiledEngine(found, second, 1).update(steps, once, np.random.default_rng(0))
+        parameters = zip(expected.parameters(), found.parameters(), strict=True)
+        return max(float((a.detach() - b.detach()).abs().max()) for a, b in parameters)
 
 
 class _Run:
     """One update under way."""
 
-    def __init__(self, engine: FusedEngine, columns: list[Array], options: Array) -> None:
+    def __init__(self, engine: CompiledEngine, columns: list[Array], options: Array) -> None:
         self.engine, self.columns, self.options = engine, columns, options
         self.control = np.zeros(threads.CONTROL_SIZE, np.int64)
         self.exchange, self.ledgers = np.zeros(4 * kernels.LEDGER), np.zeros((4, kernels.LEDGER))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,11 @@ import torch
 from tightrope.algorithms import a2c, ppo, reinforce
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import UpdateSettings
-from tightrope.control.engine.base import Acted, Array
+from tightrope.control.engine.base import Acted, Steps
 from tightrope.control.policy.normalise import ObservationNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.settings import TrainSettings
+from tightrope.control.spaces import Array, Inputs
 from tightrope.maths import returns
 
 ALGORITHMS = {"ppo": ppo, "a2c": a2c, "reinforce": reinforce}
@@ -25,8 +27,9 @@ class TorchEngine:
 
     name = "torch"
 
-    def __init__(self, policy: Policy, settings: TrainSettings) -> None:
+    def __init__(self, policy: Policy, optimiser: torch.optim.Optimizer, settings: TrainSettings) -> None:
         self.policy = policy
+        self.optimiser = optimiser
         self.algorithm = ALGORITHMS[settings.algorithm]
         self.gsde_steps = settings.gsde_steps
         self.device = policy.device
@@ -44,7 +47,7 @@ class TorchEngine:
 
     def act(
         self,
-        inputs: dict[str, Array],
+        inputs: Inputs,
         normaliser: ObservationNormaliser | None,
         action_mask: Array | None,
         noise: Array,
@@ -61,60 +64,40 @@ class TorchEngine:
             out.inputs[name][:] = normaliser(x[rows]) if normalise else x[rows]  # type: ignore[misc]
         if action_mask is not None:
             out.inputs["action_mask"][:] = action_mask[rows]
-        tensors = self.policy.tensors(out.inputs)
-        actions, logp = self.policy.act(tensors, torch.from_numpy(noise[rows]).to(self.device), rows)
+        actions, logp = self.policy.act(out.inputs, noise[rows], rows)
         out.actions[:] = actions.cpu().numpy()
         out.logp[:] = logp.cpu().numpy()
 
     @torch.no_grad()
-    def values(self, inputs: dict[str, Array]) -> Array:
+    def values(self, inputs: Inputs) -> Array:
         """See Engine."""
         total = len(next(iter(inputs.values())))
         size = IMAGES_AT_ONCE if any(name.startswith("image") for name in inputs) else total
         parts = [
-            self.policy.tensors({n: x[i : i + size] for n, x in inputs.items()})
+            self.policy.values({name: x[i : i + size] for name, x in inputs.items()})
             for i in range(0, total, size)
         ]
-        return torch.cat([self.policy.values(part) for part in parts]).float().cpu().numpy()
+        return torch.cat(parts).float().cpu().numpy()
 
-    def gae(
-        self,
-        rewards: Array,
-        values: Array,
-        next_values: Array,
-        terminated: Array,
-        ended: Array,
-        mask: Array,
-        gamma: float,
-        gae_lambda: float,
-    ) -> Array:
+    def gae(self, steps: Steps, gamma: float, gae_lambda: float) -> Array:
         """See Engine."""
-        tensor = torch.from_numpy
-        return returns.gae(
-            tensor(rewards),
-            tensor(values),
-            tensor(next_values),
-            tensor(terminated),
-            tensor(ended),
-            gamma,
-            gae_lambda,
-            tensor(mask),
-        ).numpy()
+        tensors = {name: torch.from_numpy(x) for name, x in steps._asdict().items()}
+        return returns.gae(**tensors, gamma=gamma, gae_lambda=gae_lambda).numpy()
 
     def update(
         self,
-        optimiser: torch.optim.Optimizer,
         batch: Batch,
         settings: UpdateSettings,
         rng: np.random.Generator,
-        **more: Any,
+        *,
+        refresh: Callable[[Batch], Batch] | None = None,
+        log_ratio_limit: float | None = None,
     ) -> dict[str, float]:
         """The algorithm's update, on single steps: no policy here remembers earlier ones."""
-        return self.algorithm.update(self.model, optimiser, batch.as_steps(), settings, rng, **more)
-
-    def check(self, batch: Batch, settings: UpdateSettings) -> str:
-        """Nothing to compare: this is the reference."""
-        return ""
+        return self.algorithm.update(
+            self.model, self.optimiser, batch.as_steps(), settings, rng,
+            refresh=refresh, log_ratio_limit=log_ratio_limit,
+        )  # fmt: skip
 
     def close(self) -> None:
         """Nothing to end."""

@@ -1,10 +1,8 @@
-"""What steps B environments: the interface, what a step returns, and the arrays that it is written to."""
+"""What steps B environments: the interface, and what a step returns."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,84 +19,17 @@ class Step(NamedTuple):
     rewards: np.ndarray  # float64 [B]
     terminated: np.ndarray  # bool [B]
     truncated: np.ndarray  # bool [B]; never True where terminated is
-    phantom: np.ndarray | None = (
-        None  # bool [B]: NEXT_STEP's reset, not a transition; None: none in this step
-    )
+    phantom: np.ndarray | None = None  # bool [B]: NEXT_STEP's reset, not a transition; None: none here
     final_rows: np.ndarray | None = None  # int [F]: truncated rows whose ``inputs`` are the next episode's
     final_inputs: Inputs | None = None  # [F, ...]: the true last observations of these rows
     cut: np.ndarray | None = None  # bool [B]: restarted after a fault; this step did not take place there
-
-
-@dataclass(frozen=True, eq=False)
-class StepBuffers:
-    """The arrays that N environments read their actions from and write their steps to, a row each.
-
-    Allocated once; shared memory where worker processes step the environments.
-    """
-
-    inputs: Inputs
-    final_inputs: Inputs
-    actions: np.ndarray  # float32 [N, A], already squashed where that was asked for
-    rewards: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    masks: np.ndarray  # bool [N, L]
-    cut: np.ndarray  # bool [N]: restarted in this step
-    restarts: np.ndarray  # int64 [N]: since all were reset
-    current: np.ndarray  # int64 [N]: in the first place of a group the row that it is stepping, else -1
-
-    @classmethod
-    def allocate(
-        cls,
-        num: int,
-        observations: ObservationLayout,
-        actions: ActionLayout,
-        zeros: Callable[..., Any] = np.zeros,
-    ) -> StepBuffers:
-        """Buffers for ``num`` environments; ``zeros(shape, dtype)`` makes each array."""
-        return cls(
-            inputs=observations.allocate(num, zeros),
-            final_inputs=observations.allocate(num, zeros),
-            actions=zeros((num, actions.num_columns), np.float32),
-            rewards=zeros((num,), np.float64),
-            terminated=zeros((num,), np.bool_),
-            truncated=zeros((num,), np.bool_),
-            masks=zeros((num, actions.num_logits), np.bool_),
-            cut=zeros((num,), np.bool_),
-            restarts=zeros((num,), np.int64),
-            current=zeros((num,), np.int64),
-        )
-
-    def map(self, function: Callable[[Any], Any]) -> StepBuffers:
-        """The same buffers with ``function`` applied to each array."""
-
-        def mapped(value: Any) -> Any:
-            if isinstance(value, dict):
-                return {name: function(array) for name, array in value.items()}
-            return function(value)
-
-        return StepBuffers(**{field.name: mapped(getattr(self, field.name)) for field in fields(self)})
-
-    def step(self, has_masks: bool) -> Step:
-        """A copy of what the last step left here."""
-        rows = np.flatnonzero(self.truncated) if self.truncated.any() else None
-        return Step(
-            inputs={name: array.copy() for name, array in self.inputs.items()},
-            action_mask=self.masks.copy() if has_masks else None,
-            rewards=self.rewards.copy(),
-            terminated=self.terminated.copy(),
-            truncated=self.truncated.copy(),
-            final_rows=rows,
-            final_inputs=None if rows is None else {k: array[rows] for k, array in self.final_inputs.items()},
-            cut=self.cut.copy() if self.cut.any() else None,
-        )
 
 
 class Environments(ABC):
     """B environments of one task. Made by ``make_environments``; close it, or use it in a ``with`` statement.
 
     After an EnvironmentFault only ``close`` is allowed. ``row_groups``: slices of rows, in the order in which
-    to choose their actions, so that choosing the next overlaps with stepping the last.
+    to choose their actions: one group is stepped while the actions of the next are chosen.
     """
 
     backend: str  # "serial" | "workers" | "vector" | "envpool" | "given"
@@ -134,12 +65,9 @@ class Environments(ABC):
             self.send(rows, actions[rows])
         return self.receive()
 
+    @abstractmethod
     def send(self, rows: slice, actions: np.ndarray) -> None:
         """Hand over the actions of one row group; worker processes begin to step at once."""
-        self._send(rows, self.action_layout.squashed(actions) if self.squash else actions)
-
-    @abstractmethod
-    def _send(self, rows: slice, actions: np.ndarray) -> None: ...
 
     @abstractmethod
     def receive(self) -> Step:
@@ -150,7 +78,7 @@ class Environments(ABC):
         """The state in the middle of episodes, as JSON can hold it; EnvironmentFault when it cannot."""
 
     def set_state(self, state: dict[str, Any]) -> tuple[Inputs, np.ndarray | None]:
-        """Reset, and continue from what `get_state` returned; returns what the reset did.
+        """Reset, and continue from a state of `get_state`. Returns what `reset` returned.
 
         ValueError for a seed that no run has.
         """

@@ -8,9 +8,11 @@ environments.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -20,9 +22,10 @@ from tightrope.errors import TightropeError
 
 FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
 LONGEST_PAUSE = 2.0
-Result = TypeVar("Result")
+_T = TypeVar("_T")
 
 
+@dataclass(eq=False, repr=False)
 class EnvironmentFault(TightropeError, RuntimeError):
     """An environment raised, hung or broke Gymnasium's API, or its process died.
 
@@ -31,31 +34,21 @@ class EnvironmentFault(TightropeError, RuntimeError):
     gone or does not answer.
     """
 
-    def __init__(
-        self,
-        message: str,
-        index: int = -1,
-        step: int = -1,
-        *,
-        env_id: str = "",
-        worker: int = 0,
-        seed: int | None = None,
-        action: str | None = None,
-        lost: bool = False,
-    ) -> None:
-        super().__init__(message)
-        self.index = index
-        self.step = step
-        self.env_id = env_id
-        self.worker = worker
-        self.seed = seed
-        self.action = action
-        self.lost = lost
+    message: str
+    index: int = -1
+    step: int = -1
+    env_id: str = ""
+    worker: int = 0
+    seed: int | None = None
+    action: str | None = None
+    lost: bool = False
+
+    def __post_init__(self) -> None:
+        super().__init__(self.message)
 
     def record(self) -> dict[str, Any]:
-        """The arguments, as JSON, from which another process can build this fault again."""
-        names = ("index", "step", "env_id", "worker", "seed", "action")
-        return {"message": str(self), **{name: getattr(self, name) for name in names}}
+        """The arguments but ``lost``, as JSON, from which another process can build this fault again."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if name != "lost"}
 
 
 class ApiBreak(TightropeError):
@@ -69,15 +62,15 @@ class ApiBreak(TightropeError):
         self.index = index
 
 
-class Overdue(BaseException):
+class EnvironmentTimeout(BaseException):
     """An environment of this process exceeded its time limit.
 
-    A BaseException, so that the environment's own ``except Exception`` does not swallow it.
+    A BaseException: an ``except Exception`` in the environment must not catch it.
     """
 
 
-# what counts as an environment's fault; a signal to this process does not
-RAISED = (Exception, SystemExit, GeneratorExit, Overdue)
+# what counts as a fault of an environment; a signal to this process does not
+RAISED = (Exception, SystemExit, GeneratorExit, EnvironmentTimeout)
 
 
 class FaultPolicy(NamedTuple):
@@ -106,10 +99,10 @@ class Restarts:
     def until_it_works(
         self,
         fault: EnvironmentFault,
-        attempt: Callable[[], Result],
+        attempt: Callable[[], _T],
         explain: Callable[[BaseException], EnvironmentFault],
-    ) -> Result:
-        """What ``attempt`` returns, called again after each fault of its own.
+    ) -> _T:
+        """Return ``attempt()``, called again after each fault in it.
 
         ``explain`` turns what ``attempt`` raised into a fault, or raises. Raises the last fault when the
         limit is reached.
@@ -129,7 +122,7 @@ class Restarts:
             f"{fault}\nEnvironments were restarted {self.count} times; max_env_restarts allows no more. Fix "
             "the environment, or allow more."
         )
-        return EnvironmentFault(**{**fault.record(), "message": message})
+        return dataclasses.replace(fault, message=message, lost=False)
 
 
 def restart_seed(seed: int, restarts: int, index: int) -> int:
@@ -168,9 +161,9 @@ def explained(
     action: str | None,
     advice: str = "",
 ) -> EnvironmentFault:
-    """The fault for what ``who`` raised; an error of the environment's own brings its traceback."""
+    """The fault for an error of ``who``; the environment's own errors come with their traceback."""
     api = isinstance(error, ApiBreak)
-    if isinstance(error, Overdue):
+    if isinstance(error, EnvironmentTimeout):
         what = f"was {error}"
     elif api or raised_here(error):
         what = f"does not follow Gymnasium's API: {error}"
@@ -203,7 +196,7 @@ def raised_here(error: BaseException) -> bool:
     return bool(frames) and control in Path(frames[-1].filename).parents
 
 
-def describe(value: Any) -> str:
+def kind_of(value: Any) -> str:
     """A value in a few words for an error message."""
     if isinstance(value, tuple):
         return f"a tuple of {len(value)} values"
@@ -213,33 +206,6 @@ def describe(value: Any) -> str:
 
 
 # --------------------------------------------------------------------------------------------------- checks
-
-
-def check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
-    """The pair (observation, info) that ``reset`` returned; ApiBreak when it is something else."""
-    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
-        raise ApiBreak(
-            f"reset returned {describe(result)}, expected the pair (observation, info dict). "
-            "Environments of the old gym API must be ported to Gymnasium 1.x"
-        )
-    return result
-
-
-def check_step(result: Any) -> None:
-    """Check the first step of an environment; ApiBreak names what it returned and what was expected."""
-    if not isinstance(result, tuple) or len(result) != 5:
-        raise ApiBreak(
-            f"step returned {describe(result)}, expected five values: observation, reward, terminated, "
-            "truncated, info. Environments of the old gym API (four values) must be ported to Gymnasium 1.x"
-        )
-    _, reward, terminated, truncated, info = result
-    if isinstance(reward, str | bytes | None) or np.ndim(reward) != 0:
-        raise ApiBreak(f"the reward is {reward!r}, expected one number")
-    for name, flag in (("terminated", terminated), ("truncated", truncated)):
-        if not isinstance(flag, bool | np.bool_ | int):
-            raise ApiBreak(f"{name} is {flag!r}, expected True or False")
-    if not isinstance(info, dict):
-        raise ApiBreak(f"info is {describe(info)}, expected a dict")
 
 
 def check_finite(what: str, numbers: Any) -> None:

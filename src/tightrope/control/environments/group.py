@@ -1,6 +1,6 @@
 """Several environments stepped one after the other in one process.
 
-Each is reset in the step in which its episode ends, so that no row is ever wasted; the true final observation
+Each is reset in the step in which its episode ends, so every row is a transition. The true final observation
 of a truncated episode is kept.
 """
 
@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from tightrope.control.environments import state as states
-from tightrope.control.environments.base import StepBuffers
+from tightrope.control.environments.base import Step
 from tightrope.control.environments.faults import (
     RAISED,
     ApiBreak,
@@ -23,15 +24,86 @@ from tightrope.control.environments.faults import (
     Restarts,
     action_text,
     check_finite,
-    check_reset,
-    check_step,
     explained,
+    kind_of,
     seed_of,
     wait_before_restart,
 )
-from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, check_first_step, find_source
+from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, find_source
 from tightrope.control.environments.tasks import check_alike, make_all
-from tightrope.control.spaces import Inputs, action_layout, observation_layout
+from tightrope.control.spaces import (
+    MASK_KEY,
+    ActionLayout,
+    Inputs,
+    ObservationLayout,
+    action_layout,
+    observation_layout,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StepBuffers:
+    """The arrays that N environments read their actions from and write their steps to, a row each.
+
+    Allocated once; shared memory where worker processes step the environments.
+    """
+
+    inputs: Inputs
+    final_inputs: Inputs
+    actions: np.ndarray  # float32 [N, A], already squashed where that was asked for
+    rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    masks: np.ndarray  # bool [N, L]
+    cut: np.ndarray  # bool [N]: restarted in this step
+    restarts: np.ndarray  # int64 [N]: since all were reset
+    current: np.ndarray  # int64 [N]: in the first place of a group the row that it is stepping, else -1
+
+    @classmethod
+    def allocate(
+        cls,
+        num: int,
+        observations: ObservationLayout,
+        actions: ActionLayout,
+        zeros: Callable[..., Any] = np.zeros,
+    ) -> StepBuffers:
+        """Buffers for ``num`` environments; ``zeros(shape, dtype)`` makes each array."""
+        return cls(
+            inputs=observations.allocate(num, zeros),
+            final_inputs=observations.allocate(num, zeros),
+            actions=zeros((num, actions.num_columns), np.float32),
+            rewards=zeros((num,), np.float64),
+            terminated=zeros((num,), np.bool_),
+            truncated=zeros((num,), np.bool_),
+            masks=zeros((num, actions.num_logits), np.bool_),
+            cut=zeros((num,), np.bool_),
+            restarts=zeros((num,), np.int64),
+            current=zeros((num,), np.int64),
+        )
+
+    def map(self, function: Callable[[Any], Any]) -> StepBuffers:
+        """The same buffers with ``function`` applied to each array."""
+
+        def mapped(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {name: function(array) for name, array in value.items()}
+            return function(value)
+
+        return StepBuffers(**{field.name: mapped(getattr(self, field.name)) for field in fields(self)})
+
+    def step(self, has_masks: bool) -> Step:
+        """The last step, copied."""
+        rows = np.flatnonzero(self.truncated) if self.truncated.any() else None
+        return Step(
+            inputs={name: array.copy() for name, array in self.inputs.items()},
+            action_mask=self.masks.copy() if has_masks else None,
+            rewards=self.rewards.copy(),
+            terminated=self.terminated.copy(),
+            truncated=self.truncated.copy(),
+            final_rows=rows,
+            final_inputs=None if rows is None else {k: array[rows] for k, array in self.final_inputs.items()},
+            cut=self.cut.copy() if self.cut.any() else None,
+        )
 
 
 class EnvGroup:
@@ -121,7 +193,7 @@ class EnvGroup:
         """Reset one environment with its seed."""
         self._calls += 1
         self.buffers.current[0] = row
-        observation, info = check_reset(self.envs[row].reset(seed=self._seed_of(row)))
+        observation, info = _check_reset(self.envs[row].reset(seed=self._seed_of(row)))
         self._plain &= isinstance(observation, np.ndarray)
         self.observation_layout.write(observation, self._rows[row])
         if self.policy.restart:
@@ -132,7 +204,7 @@ class EnvGroup:
 
     def _step_from(self, begin: int, actions: Iterator[Any]) -> int:
         """Step from row ``begin`` on; the row to continue from, behind one that was restarted."""
-        # local names: this loop is the cost of every step
+        # local names are faster, and this loop runs at every step
         buffers, plain, shape, checked = self.buffers, self._plain, self._shape, self._checked
         envs, rewards, flat_rows, current = self.envs, buffers.rewards, self._flat_rows, buffers.current
         has_masks, strict = self.has_masks, self.policy.restart
@@ -142,8 +214,7 @@ class EnvGroup:
                 current[0] = row
                 result = envs[row].step(action)
                 if not checked:
-                    check_step(result)
-                    check_first_step(result[4], has_masks)
+                    _check_step(result, has_masks)
                 observation, reward, terminated, truncated, info = result
                 rewards[row] = reward
                 if strict:
@@ -265,12 +336,12 @@ class EnvGroup:
 
     def get_state(self) -> list[Any]:
         """The packed state of every environment (see state.py)."""
-        return [self._state_call(row, states.state_of, env) for row, env in enumerate(self.envs)]
+        return [self._state_call(row, states.saved_state, env) for row, env in enumerate(self.envs)]
 
     def set_state(self, found: list[Any]) -> None:
         """Put packed states back into environments that have been reset."""
         for row, (env, state) in enumerate(zip(self.envs, found, strict=True)):
-            self._state_call(row, states.put_back, env, state)
+            self._state_call(row, states.restore_state, env, state)
 
     def _state_call(self, row: int, function: Callable[..., Any], *arguments: Any) -> Any:
         self._calls += 1
@@ -289,3 +360,34 @@ class EnvGroup:
             ) from error
         finally:
             self.buffers.current[0] = -1
+
+
+def _check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
+    """The pair (observation, info) that ``reset`` returned; ApiBreak when it is something else."""
+    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
+        raise ApiBreak(
+            f"reset returned {kind_of(result)}, expected the pair (observation, info dict). "
+            "Environments of the old gym API must be ported to Gymnasium 1.x"
+        )
+    return result
+
+
+def _check_step(result: Any, has_masks: bool) -> None:
+    """Check the first step of an environment. ApiBreak when it does not follow Gymnasium's API."""
+    if not isinstance(result, tuple) or len(result) != 5:
+        raise ApiBreak(
+            f"step returned {kind_of(result)}, expected five values: observation, reward, terminated, "
+            "truncated, info. Environments of the old gym API (four values) must be ported to Gymnasium 1.x"
+        )
+    _, reward, terminated, truncated, info = result
+    if isinstance(reward, str | bytes | None) or np.ndim(reward) != 0:
+        raise ApiBreak(f"the reward is {reward!r}, expected one number")
+    for name, flag in (("terminated", terminated), ("truncated", truncated)):
+        if not isinstance(flag, bool | np.bool_ | int):
+            raise ApiBreak(f"{name} is {flag!r}, expected True or False")
+    if not isinstance(info, dict):
+        raise ApiBreak(f"info is {kind_of(info)}, expected a dict")
+    if MASK_KEY in info and not has_masks:
+        raise ApiBreak(
+            f"step gives info[{MASK_KEY!r}] but reset did not; give it at every reset and every step"
+        )

@@ -15,7 +15,7 @@ from tightrope.control.environments.processes import available_cores
 from tightrope.control.environments.vector import VectorEnvironments, is_vector_env
 
 BACKENDS = ("auto", "serial", "workers", "vector", "envpool")
-# A step of these takes tens of microseconds, so that waking a worker pays.
+# A step of these takes tens of microseconds: long enough for a worker process to save time.
 SLOW_MODULES = ("gymnasium.envs.mujoco", "gymnasium.envs.box2d")
 # Numpy: 43 us a step for any small number of environments, against about 7.5 us each one by one.
 NUMPY_VECTOR_IDS = ("CartPole-v0", "CartPole-v1")
@@ -32,10 +32,10 @@ class Backend(NamedTuple):
 def choose_backend(
     env_id: str | None, num_envs: int, num_workers: int | None = None, cores: int = 1
 ) -> Backend:
-    """The backend that ``auto`` means: a function of these arguments, never of a timing.
+    """The backend that ``auto`` means. It depends only on these arguments, never on a timing.
 
     ``env_id`` None: a factory, or an instance without a spec. Asking for more than one worker means workers.
-    Jax versions of a task are never chosen: they would be compiled first.
+    Jax versions of a task are never chosen, because they must be compiled first.
     """
     if num_workers is not None and num_workers > 1 and num_envs > 1:
         return Backend("workers", min(num_workers, num_envs))
@@ -61,8 +61,8 @@ def make_environments(
     """``num_envs`` environments from a Gymnasium id, an instance, a factory, or a vector environment.
 
     ``num_envs`` None: 1, or what the vector environment has. A given instance or vector environment is
-    stepped but never closed. ``policy``: what a fault leads to. ValueError: an unknown id, a backend the task
-    does not have, an instance that cannot be replicated, spaces that are not supported.
+    stepped but never closed. ``policy``: what happens after a fault. ValueError: an unknown id, a backend
+    that the task does not have, an instance that cannot be replicated, spaces that are not supported.
     """
     if backend not in BACKENDS:
         raise ValueError(f"vector backend is {backend!r}; expected one of: {', '.join(BACKENDS)}.")
@@ -74,11 +74,6 @@ def make_environments(
         num_envs = 1 if num_envs is None else num_envs
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; expected at least 1.")
-        if not isinstance(env, str | gym.Env) and not callable(env):
-            raise ValueError(
-                f"env is a {type(env).__name__}; expected a Gymnasium id, an environment, a zero-argument "
-                "factory or a vector environment."
-            )
         chosen = _resolve(env, num_envs, backend, num_workers)
         if isinstance(env, str) and chosen.name in ("vector", "envpool"):
             environments = _vector_version(env, num_envs, chosen.name, policy)
@@ -101,7 +96,8 @@ def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> 
     if backend in ("vector", "envpool"):
         if not isinstance(env, str):
             raise ValueError(
-                f"vector backend {backend!r} needs a Gymnasium id; {_name(env)} is an object. Use auto."
+                f"vector backend {backend!r} needs a Gymnasium id; {tasks.name_of(env)} is an object. "
+                "Use auto."
             )
         return Backend(backend)
     if backend == "serial":
@@ -117,17 +113,8 @@ def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> 
 
 
 def _pool(env: Any, num_envs: int, num_groups: int, policy: FaultPolicy) -> EnvironmentPool:
-    makers: list[Callable[[], gym.Env]]
-    if isinstance(env, str):
-        name = env
-        makers = [lambda: tasks.make_by_id(env)] * num_envs
-    elif isinstance(env, gym.Env):
-        name = _name(env)
-        makers = tasks.replicas(env, num_envs)
-    else:
-        name = getattr(env, "__name__", type(env).__name__)
-        makers = [env] * num_envs
-    pool = EnvironmentPool(makers, num_groups, name, keep_first=isinstance(env, gym.Env), policy=policy)
+    makers, given = tasks.makers_of(env, num_envs), isinstance(env, gym.Env)
+    pool = EnvironmentPool(makers, num_groups, tasks.name_of(env), keep_first=given, policy=policy)
     if isinstance(env, str):
         pool.spec_id = env
     return pool
@@ -143,7 +130,7 @@ def _vector_version(env_id: str, num_envs: int, backend: str, policy: FaultPolic
         threads = min(num_envs, available_cores())
         make = lambda seed: tasks.make_envpool(env_id, num_envs, seed, threads)  # noqa: E731
         environments = VectorEnvironments(make, env_id, policy, make, int32_actions=True)
-    environments.max_episode_steps = _time_limit(tasks.find_spec(env_id))
+    environments.max_episode_steps = tasks.time_limit(env_id)
     return environments
 
 
@@ -158,15 +145,8 @@ def _given(env: Any, num_envs: int | None, backend: str, policy: FaultPolicy) ->
             f"vector backend {backend!r} asked for, but a vector environment was given. Use auto."
         )
     envpool = not isinstance(env, gym.vector.VectorEnv)
-    environments = VectorEnvironments(lambda seed: env, _name(env), policy, keep=True, int32_actions=envpool)
-    environments.max_episode_steps = _time_limit(getattr(env, "spec", None))
+    environments = VectorEnvironments(
+        lambda seed: env, tasks.name_of(env), policy, keep=True, int32_actions=envpool
+    )
+    environments.max_episode_steps = tasks.time_limit(env)
     return environments
-
-
-def _time_limit(spec: Any) -> int | None:
-    return getattr(spec, "max_episode_steps", None)
-
-
-def _name(env: Any) -> str:
-    spec = getattr(env, "spec", None)
-    return getattr(spec, "id", None) or type(getattr(env, "unwrapped", env)).__name__

@@ -77,14 +77,6 @@ def _method_of_vector(env: Any) -> Callable[[], Any] | None:
     return (lambda: np.stack([np.asarray(mask) for mask in env.call(METHOD)])) if found else None
 
 
-def check_first_step(info: dict[str, Any], has_masks: bool) -> None:
-    """ApiBreak when the first step gives a mask although reset gave none."""
-    if MASK_KEY in info and not has_masks:
-        raise ApiBreak(
-            f"step gives info[{MASK_KEY!r}] but reset did not; give it at every reset and every step"
-        )
-
-
 def flat_mask(mask: Any, rows: int, actions: ActionLayout) -> np.ndarray | None:
     """Masks in any form that `ActionLayout.flatten_mask` takes, as bool [rows, L]; None stays None.
 

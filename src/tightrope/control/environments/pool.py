@@ -1,8 +1,8 @@
 """Single environments spread over this process and worker processes.
 
-With k groups this process steps the first one and k - 1 workers step the others, so that no core waits. Where
-a fault is to be survived this process steps none and k workers step them all: a worker that dies takes
-nothing else along.
+With k groups this process steps the first one and k - 1 workers step the others, so no core waits. If the run
+must survive faults, this process steps none and k workers step all: when a worker dies, only its own
+environments are lost.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import gymnasium as gym
 import numpy as np
 
 from tightrope.control.environments import state as states
-from tightrope.control.environments.base import Environments, Step, StepBuffers
+from tightrope.control.environments.base import Environments, Step
 from tightrope.control.environments.faults import (
     RAISED,
     EnvironmentFault,
@@ -32,7 +32,7 @@ from tightrope.control.environments.faults import (
     seed_of,
     wait_before_restart,
 )
-from tightrope.control.environments.group import EnvGroup
+from tightrope.control.environments.group import EnvGroup, StepBuffers
 from tightrope.control.environments.processes import (
     BROKEN,
     CLOSE,
@@ -45,7 +45,7 @@ from tightrope.control.environments.processes import (
     SPIN,
     STEP,
     SharedArray,
-    Worker,
+    WorkerProcess,
     available_cores,
     close_inherited,
     pack_json,
@@ -91,7 +91,7 @@ class EnvironmentPool(Environments):
         workers_first = (slice(here, self.num_envs), slice(0, here))  # they step while this process chooses
         self.row_groups = workers_first if 0 < here < self.num_envs else (slice(0, self.num_envs),)
         self._group: EnvGroup | None = None  # stepped in this process
-        self._workers: list[Worker] = []
+        self._workers: list[WorkerProcess] = []
         self._watchdog: Watchdog | None = None
         envs: list[gym.Env] = []
         try:
@@ -135,12 +135,12 @@ class EnvironmentPool(Environments):
         else:
             self._buffers = StepBuffers.allocate(self.num_envs, *layouts)
 
-    def _start(self, number: int) -> Worker:
+    def _start(self, number: int) -> WorkerProcess:
         """Start the process of group ``number``."""
         first, last = self._bounds[number : number + 2]
         spin = SPIN if len(self._bounds) - 1 <= available_cores() else 0.0
         makers = self._makers[first:last]
-        return Worker(
+        return WorkerProcess(
             self._context, _serve, makers, self._shared, first, number, self.name, spin, self.policy
         )
 
@@ -160,8 +160,9 @@ class EnvironmentPool(Environments):
         step = self._buffers.step(self._has_masks)
         return step.inputs, step.action_mask
 
-    def _send(self, rows: slice, actions: np.ndarray) -> None:
-        self._buffers.actions[rows] = actions
+    def send(self, rows: slice, actions: np.ndarray) -> None:
+        """See Environments."""
+        self._buffers.actions[rows] = self.action_layout.squashed(actions) if self.squash else actions
         if rows.stop > self._bounds[1]:
             for worker in self._workers:
                 worker.send(STEP)
@@ -244,7 +245,7 @@ class EnvironmentPool(Environments):
             return self._restart(place, fault)
 
     def _restart(self, place: int, fault: EnvironmentFault) -> bool:
-        """Replace a process that is gone by another one, and reset its environments; as `Worker.wait`."""
+        """Replace a process that is gone and reset its environments; the result is that of `wait`."""
         buffers = self._buffers
         rows = slice(*self._bounds[place + 1 : place + 3])
 
@@ -272,9 +273,9 @@ class EnvironmentPool(Environments):
         return masked
 
     def _described(
-        self, worker: Worker, fault: EnvironmentFault, doing: str = "stepping"
+        self, worker: WorkerProcess, fault: EnvironmentFault, doing: str = "stepping"
     ) -> EnvironmentFault:
-        """The fault of a process that is gone, with what is known of the environment it was stepping."""
+        """The fault of a process that is gone; it names the environment that was being stepped."""
         row = int(self._buffers.current[worker.first])
         if row < 0:
             return fault
@@ -339,7 +340,7 @@ def _serve(
     spin: float,
     policy: FaultPolicy,
 ) -> None:
-    """The life of a worker: make its environments, then obey commands until told to stop."""
+    """What a worker does: make its environments, then execute commands until CLOSE."""
     # Ctrl-C reaches the whole process group; the main process ends its workers in order
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not the main process's handler, which a fork inherits

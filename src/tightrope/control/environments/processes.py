@@ -1,4 +1,4 @@
-"""Worker processes, seen from the main process, and the channel between the two.
+"""Worker processes as the main process sees them, and the channel between the two.
 
 Arrays are shared memory. A socket carries fixed-size commands and replies, and JSON text for the states of
 environments and for a fault.
@@ -31,7 +31,7 @@ RESET, STEP, GET_STATE, SET_STATE, CLOSE = b"r", b"s", b"g", b"p", b"c"
 LENGTH = struct.Struct("<Q")
 READY, MASKED, BROKEN = b"k", b"m", b"e"  # replies: done; done, and there are action masks; a fault follows
 TO_BUILD = 60.0  # seconds at least to make the environments, which may import much
-SPIN = 2e-4  # seconds to poll for a message before sleeping; waking a sleeper costs about as much as a step
+SPIN = 2e-4  # seconds to poll for a message before sleeping; waking up costs about as much as a step
 
 _yield_core: Callable[[], Any] = getattr(os, "sched_yield", int)  # int() where there is nothing to call
 _parent_ends: weakref.WeakSet[socket.socket] = weakref.WeakSet()
@@ -61,13 +61,13 @@ def start_context() -> BaseContext:
 
     fork on Linux: the worker takes the user's factory and modules as they are in memory, nothing is pickled
     and the user's script needs no ``if __name__ == "__main__"``. It is safe here because a worker runs
-    environments and numpy alone and never touches torch, whose threads do not survive a fork. spawn
+    environments and numpy only and never touches torch, whose threads do not survive a fork. spawn
     elsewhere.
     """
     return multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
 
 
-class Worker:
+class WorkerProcess:
     """The main process's end of one worker process, which runs ``serve`` (see pool.py)."""
 
     def __init__(
@@ -140,7 +140,7 @@ class Worker:
             raise self._lost("died while it answered") from error
 
     def _set_patience(self, seconds: float | None) -> None:
-        """Let a blocking ``recv`` give up after ``seconds``; the kernel's timeout costs one call less."""
+        """Let a blocking ``recv`` give up after ``seconds``; the kernel's timeout saves a system call."""
         self._patience = seconds or 0.0
         if hasattr(socket, "MSG_DONTWAIT"):
             whole, part = divmod(seconds or 0.0, 1.0)  # 0: never
@@ -179,7 +179,7 @@ class Worker:
 
 
 def pack_json(value: Any) -> bytes:
-    """A value as JSON text behind its length, as `Worker` reads it."""
+    """A value as JSON text behind its length, as `WorkerProcess` reads it."""
     data = json.dumps(value, allow_nan=False).encode()
     return LENGTH.pack(len(data)) + data
 

@@ -2,8 +2,8 @@
 
 An environment takes part by two methods: ``get_state()`` returns what it is in the middle of, made of None,
 numbers, strings, bytes, lists, dicts with string keys and numpy arrays; ``set_state(state)`` continues from
-there. Its generator ``np_random`` and Gymnasium's time limit are kept for it. A wrapper in between that has
-a state of its own needs the two methods itself, and then speaks for everything inside it.
+there. Its generator ``np_random`` and Gymnasium's time limit are saved for it. A wrapper with a state needs
+both methods; they must then cover everything inside the wrapper.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
-KINDS = "biufc"  # of arrays: bool, int, unsigned, float, complex
+ARRAY_KINDS = "biufc"  # of arrays: bool, int, unsigned, float, complex
 ARRAY, BYTES, NUMBER = "array", "bytes", "number"
 # the methods by which an environment gives and takes its state
 GET, SET = "get_state", "set_state"
 
 
-def pack(value: Any, place: str = "state") -> Any:
-    """``value`` in terms of JSON, exactly. TypeError for what no file can hold without pickling it."""
+def encode(value: Any, place: str = "state") -> Any:
+    """``value`` as JSON, without loss. TypeError for what a file could hold only by pickling it."""
     if (
         value is None
         or isinstance(value, bool | int | str)
@@ -34,34 +34,34 @@ def pack(value: Any, place: str = "state") -> Any:
         return {NUMBER: repr(value)}  # JSON has no NaN and no infinities
     if isinstance(value, bytes):
         return {BYTES: base64.b64encode(value).decode()}
-    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in KINDS:
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in ARRAY_KINDS:
         whole = np.ascontiguousarray(value)
         text = base64.b64encode(whole.tobytes()).decode()
         return {ARRAY: [whole.dtype.str, list(np.shape(value)), text]}
     if isinstance(value, list | tuple):
-        return [pack(item, f"{place}[{index}]") for index, item in enumerate(value)]
+        return [encode(item, f"{place}[{index}]") for index, item in enumerate(value)]
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        return {"dict": {key: pack(item, f"{place}[{key!r}]") for key, item in value.items()}}
+        return {"dict": {key: encode(item, f"{place}[{key!r}]") for key, item in value.items()}}
     raise TypeError(
         f"{place} is a {type(value).__name__}, which no file can hold without pickling it; give None, "
         "numbers, strings, bytes, lists, dicts with string keys and numpy arrays of numbers"
     )
 
 
-def unpack(value: Any) -> Any:
-    """What `pack` was given; tuples come back as lists. ValueError for anything that it did not make."""
+def decode(value: Any) -> Any:
+    """The inverse of `encode`; tuples become lists. ValueError for anything else."""
     if isinstance(value, list):
-        return [unpack(item) for item in value]
+        return [decode(item) for item in value]
     if not isinstance(value, dict):
         return value
     match value:
         case {"dict": dict(inner)}:
-            return {key: unpack(item) for key, item in inner.items()}
+            return {key: decode(item) for key, item in inner.items()}
         case {"number": str(text)}:
             return float(text)
         case {"bytes": str(text)}:
             return base64.b64decode(text)
-        case {"array": [str(kind), list(shape), str(text)]} if np.dtype(kind).kind in KINDS:
+        case {"array": [str(kind), list(shape), str(text)]} if np.dtype(kind).kind in ARRAY_KINDS:
             found = np.frombuffer(base64.b64decode(text), np.dtype(kind)).reshape(shape).copy()
             return found if shape else found[()]
     raise ValueError(f"a saved state holds {str(value)[:80]}, which this version does not read.")
@@ -76,55 +76,45 @@ def alike(found: Any, like: Any) -> bool:
     return found is None and like is None
 
 
-def _layers(env: gym.Env) -> tuple[list[TimeLimit], Any] | None:
+def _stateful(env: Any) -> tuple[list[TimeLimit], Any] | None:
     """The time limits around the layer that gives a state, and that layer; None where there is none, or where
-    a wrapper outside it has a state that nobody knows.
+    a wrapper outside it may have a state.
     """
     limits: list[TimeLimit] = []
-    layer: Any = env
-    while not (callable(getattr(layer, GET, None)) and callable(getattr(layer, SET, None))):
-        if isinstance(layer, TimeLimit):
-            limits.append(layer)
-        elif not isinstance(layer, OrderEnforcing | PassiveEnvChecker):
+    while not (callable(getattr(env, GET, None)) and callable(getattr(env, SET, None))):
+        if isinstance(env, TimeLimit):
+            limits.append(env)
+        elif not isinstance(env, OrderEnforcing | PassiveEnvChecker):
             return None
-        layer = layer.env
-    return limits, layer
-
-
-def _given(env: gym.Env) -> tuple[list[TimeLimit], Any]:
-    found = _layers(env)
-    assert found is not None, "asked for a state that it cannot give"
-    return found
+        env = env.env
+    return limits, env
 
 
 def gives_state(env: Any) -> bool:
     """Whether a single or a vector environment can give its state."""
-    if isinstance(env, gym.Env):
-        return _layers(env) is not None
-    return callable(getattr(env, GET, None)) and callable(getattr(env, SET, None))
+    return _stateful(env) is not None
 
 
-def state_of(env: Any) -> Any:
-    """The packed state of an environment that gives one. TypeError as `pack`."""
-    if not isinstance(env, gym.Env):
-        return pack({"own": env.get_state()})
-    limits, layer = _given(env)
+def saved_state(env: Any) -> Any:
+    """The encoded state of an environment that gives one. TypeError as `encode`."""
+    layers = _stateful(env)
+    assert layers is not None
+    limits, layer = layers
     found = {"own": layer.get_state(), "elapsed": [limit._elapsed_steps for limit in limits]}
-    rng = getattr(env.unwrapped, "_np_random", None)
+    rng = getattr(env.unwrapped, "_np_random", None) if isinstance(env, gym.Env) else None
     if isinstance(rng, np.random.Generator):
         found["rng"] = rng.bit_generator.state
-    return pack(found)
+    return encode(found)
 
 
-def put_back(env: Any, packed: Any) -> None:
-    """Give an environment, which has been reset, the state that `state_of` found."""
-    state = unpack(packed)
-    if not isinstance(env, gym.Env):
-        env.set_state(state["own"])
-        return
-    limits, layer = _given(env)
+def restore_state(env: Any, encoded: Any) -> None:
+    """Give an environment, which has been reset, the state that `saved_state` found."""
+    layers, state = _stateful(env), decode(encoded)
+    assert layers is not None
+    limits, layer = layers
     layer.set_state(state["own"])
-    for limit, elapsed in zip(limits, state["elapsed"], strict=True):
+    # "elapsed" is missing for vector environments of older runs
+    for limit, elapsed in zip(limits, state.get("elapsed", ()), strict=True):
         limit._elapsed_steps = elapsed
     if "rng" in state:
         env.unwrapped.np_random.bit_generator.state = state["rng"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import difflib
+import functools
 import importlib
 import importlib.util
 import warnings
@@ -27,7 +28,7 @@ EXTRAS = {
     "gymnasium.envs.mujoco": ("mujoco", "mujoco"),
     "ale_py": ("ale_py", "atari"),
 }
-# What third parties say while a standard task is built, and what no user can act on.
+# Warnings of third parties while a standard task is built; a user can do nothing about them.
 NOISE = (
     r".*precision lowered by casting.*",
     r".*pkg_resources is deprecated.*",
@@ -42,6 +43,20 @@ def find_spec(env_id: str) -> EnvSpec | None:
     """The registered spec of an id, Atari included; None without one (yet: "module:Id" imports first)."""
     register_atari(env_id)
     return gym.registry.get(env_id.rpartition(":")[2])
+
+
+def name_of(env: Any) -> str:
+    """An id; the id of an environment object, else the name of its class or of the factory."""
+    if isinstance(env, str):
+        return env
+    known = getattr(getattr(env, "spec", None), "id", None) or getattr(env, "__name__", None)
+    return str(known or type(getattr(env, "unwrapped", env)).__name__)
+
+
+def time_limit(env: Any) -> int | None:
+    """The steps after which an id or an environment object truncates an episode; None: none, or unknown."""
+    spec = find_spec(env) if isinstance(env, str) else getattr(env, "spec", None)
+    return getattr(spec, "max_episode_steps", None)
 
 
 def entry_module(spec: EnvSpec | None) -> str:
@@ -62,8 +77,8 @@ def register_atari(env_id: str) -> None:
 
 
 @contextlib.contextmanager
-def quiet(spec: EnvSpec | None = None) -> Iterator[None]:
-    """Keep the known noise of third parties off stderr while a task is built; every other warning passes."""
+def without_noise(spec: EnvSpec | None = None) -> Iterator[None]:
+    """Hide the known warnings of third parties while a task is built; every other warning passes."""
     with warnings.catch_warnings(), contextlib.ExitStack() as stack:
         for message in NOISE:
             warnings.filterwarnings("ignore", message=message)
@@ -106,18 +121,16 @@ def make_vector_by_id(env_id: str, num_envs: int) -> Any:
         )
 
     def make() -> Any:
-        return _trusting(made())
-
-    def made() -> Any:
+        make_vec = functools.partial(gym.make_vec, env_id, num_envs, vectorization_mode="vector_entry_point")
         same_step: dict[str, Any] = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
         if env_id.startswith("ALE/"):
-            same_step["reward_clipping"] = False  # returns are reported in the game's own points
+            same_step["reward_clipping"] = False  # returns are reported in the points of the game
         try:
-            return gym.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **same_step)
+            return _trusting(make_vec(**same_step))
         except TypeError as error:
             if "autoreset_mode" not in str(error):
                 raise
-        return gym.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point")
+        return _trusting(make_vec())
 
     return _explained(env_id, make)
 
@@ -130,7 +143,7 @@ class _AnyAction(gym.spaces.MultiDiscrete):
 
 
 def _trusting(env: Any) -> Any:
-    """Spare a vector version of our own making the check of every action: a fifth of a CartPole step."""
+    """Skip the check of every action in a vector version that we made: a fifth of a CartPole step."""
     space = env.action_space
     if type(space) is gym.spaces.MultiDiscrete:
         env.action_space = _AnyAction(space.nvec, dtype=space.dtype, start=space.start)
@@ -152,7 +165,7 @@ def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int) -> Any
         raise ValueError(
             f"EnvPool has no task {name!r}.{_did_you_mean(name, known)} Or use another vector backend."
         )
-    with quiet():
+    with without_noise():
         return envpool.make(name, env_type="gymnasium", num_envs=num_envs, seed=seed, num_threads=num_threads)
 
 
@@ -160,7 +173,7 @@ def _explained(env_id: str, make: Callable[[], Any]) -> Any:
     """What ``make`` returns; errors about the id or a missing package become a ValueError with advice."""
     spec = find_spec(env_id)
     try:
-        with quiet(spec):
+        with without_noise(spec):
             return make()
     except ModuleNotFoundError as error:
         module = env_id.partition(":")[0]
@@ -197,6 +210,20 @@ def _did_you_mean(name: str, known: Any) -> str:
     same = sorted((v for k, v in lowered.items() if k.rpartition("-v")[0] == stem), reverse=True)
     names = list(dict.fromkeys([*same, *(lowered[key] for key in close)]))[:3]
     return f" Did you mean {' or '.join(names)}?" if names else ""
+
+
+def makers_of(env: Any, num_envs: int) -> list[Callable[[], gym.Env]]:
+    """One function per copy of an id, an instance (it is copy 0 itself) or a factory. ValueError: neither."""
+    if isinstance(env, str):
+        return [lambda: make_by_id(env)] * num_envs
+    if isinstance(env, gym.Env):
+        return replicas(env, num_envs)
+    if callable(env):
+        return [env] * num_envs
+    raise ValueError(
+        f"env is a {type(env).__name__}; expected a Gymnasium id, an environment, a zero-argument "
+        "factory or a vector environment."
+    )
 
 
 def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env]) -> None:
@@ -265,7 +292,7 @@ def _from_spec(env: gym.Env) -> gym.Env:
     spec = env.spec
     if spec is None:
         raise ValueError("it has no spec")
-    with quiet(spec):
+    with without_noise(spec):
         twin = gym.make(spec, disable_env_checker=True)
     if _layers(twin) != _layers(env):
         twin.close()

@@ -28,8 +28,8 @@ from tightrope.control.environments.faults import (
     FaultPolicy,
     action_text,
     check_finite,
-    describe,
     explained,
+    kind_of,
     restart_seed,
     wait_before_restart,
 )
@@ -37,7 +37,7 @@ from tightrope.control.environments.masks import find_source, vector_masks
 from tightrope.control.environments.watchdog import Watchdog
 from tightrope.control.spaces import Inputs, action_layout, observation_layout
 
-# the second is a slip in some of Gymnasium's own environments
+# the second is a typing error in some of Gymnasium's environments
 MODE_KEYS = ("autoreset_mode", "autoreseet-mode")
 
 
@@ -64,7 +64,7 @@ def autoreset_mode(env: Any) -> AutoresetMode:
         )
     warnings.warn(
         f"{type(env).__name__} does not say in metadata['autoreset_mode'] how it resets; taken as NEXT_STEP. "
-        "Add the entry if it resets otherwise: a wrong mode spoils the advantages.",
+        "Add the entry if it resets otherwise: with a wrong mode the advantages are wrong.",
         stacklevel=2,
     )
     return AutoresetMode.NEXT_STEP
@@ -76,7 +76,7 @@ class VectorEnvironments(Environments):
 
     ``make(seed)`` gives the environment to use from a reset with this seed on: usually always the same one
     (EnvPool fixes its seeds when it is built). ``make_another(seed)`` builds another one after a fault; None:
-    impossible. ``keep`` leaves closing to the caller.
+    impossible. ``keep``: the caller closes it.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class VectorEnvironments(Environments):
                 warnings.filterwarnings("ignore", message="EnvPool seeds are fixed")
                 result = env.reset(seed=seed)
             if not (isinstance(result, tuple) and len(result) == 2):
-                raise ApiBreak(f"reset returned {describe(result)}, expected the pair (observations, infos)")
+                raise ApiBreak(f"reset returned {kind_of(result)}, expected the pair (observations, infos)")
             observations, infos = result
             self._mask_source = find_source(env, infos, self.observation_layout, self.action_layout)
             inputs = self._encode(observations)
@@ -156,8 +156,9 @@ class VectorEnvironments(Environments):
             self._in_call = False
         return inputs, masks
 
-    def _send(self, rows: slice, actions: np.ndarray) -> None:
-        self._actions = actions
+    def send(self, rows: slice, actions: np.ndarray) -> None:
+        """See Environments."""
+        self._actions = self.action_layout.squashed(actions) if self.squash else actions
 
     def receive(self) -> Step:
         """Step all rows with the actions sent; after a fault all episodes are cut."""
@@ -189,7 +190,7 @@ class VectorEnvironments(Environments):
         result = self._env.step(_to_int32(actions) if self._int32 else actions)
         if not isinstance(result, tuple) or len(result) != 5:
             raise ApiBreak(
-                f"step returned {describe(result)}, expected five values: observations, rewards, "
+                f"step returned {kind_of(result)}, expected five values: observations, rewards, "
                 "terminations, truncations, infos"
             )
         observations, rewards, terminated, truncated, infos = result
@@ -204,12 +205,12 @@ class VectorEnvironments(Environments):
             self._ended = terminated | truncated
             self._any_ended = _any(self._ended)
             masks = self._masks(observations, infos, self._ended)
-            return Step(inputs, masks, rewards, terminated, truncated, phantom)
+            return Step(inputs, masks, rewards, terminated, truncated, phantom=phantom)
         if self.mode == AutoresetMode.SAME_STEP:
             rows = np.flatnonzero(truncated) if _any(truncated) else None
             finals = None if rows is None else self._final_inputs(infos, rows)
             masks = self._masks(observations, infos, None)
-            return Step(inputs, masks, rewards, terminated, truncated, None, rows, finals)
+            return Step(inputs, masks, rewards, terminated, truncated, final_rows=rows, final_inputs=finals)
         masks = self._masks(observations, infos, terminated | truncated)
         return self._reset_ended(Step(inputs, masks, rewards, terminated, truncated))
 
@@ -241,7 +242,7 @@ class VectorEnvironments(Environments):
         except ValueError as error:
             raise ApiBreak(str(error)) from error
         if any(len(array) != self.num_envs for array in inputs.values()):
-            raise ApiBreak(f"the observations hold {describe(observations)}, expected {self.num_envs} rows")
+            raise ApiBreak(f"the observations hold {kind_of(observations)}, expected {self.num_envs} rows")
         if self.observation_layout.plain and inputs["flat"] is observations:
             # a vector environment may write into its own array again
             inputs = {"flat": inputs["flat"].copy()}
@@ -340,13 +341,13 @@ class VectorEnvironments(Environments):
 
     def get_state(self) -> dict[str, Any]:
         """See Environments."""
-        found = [states.state_of(self._env), self._ended.tolist()]
+        found = [states.saved_state(self._env), self._ended.tolist()]
         return {"seed": self._seed, "renewals": self._restarts_here, "states": found}
 
     def _set_state(self, state: dict[str, Any]) -> None:
         self._restarts_here = int(state["renewals"])
         env_state, ended = state["states"]
-        states.put_back(self._env, env_state)
+        states.restore_state(self._env, env_state)
         self._ended = np.array(ended, bool).reshape(self._ended.shape)
         self._any_ended = _any(self._ended)
 
@@ -363,7 +364,7 @@ class VectorEnvironments(Environments):
 
 
 def _any(flags: np.ndarray) -> bool:
-    """flags.any() for a handful of flags, ten times as fast: this is asked at every step."""
+    """flags.any() for a few flags, ten times as fast: it is called at every step."""
     return b"\x01" in flags.tobytes()
 
 

@@ -1,10 +1,9 @@
-"""A time limit for environments of this process: free while they answer, an exception when they hang.
+"""A time limit for environments of this process: it costs nothing while they answer, and raises otherwise.
 
-A thread checks now and then whether the call under way is still the same. One that takes too long is
-interrupted by a signal whose handler raises in the main thread, where the environment is. This works
-wherever Python can be interrupted: sleeping, waiting, computing in Python. Compiled code that never comes
-back cannot be stopped from inside its process; then a line on stderr names it. Other processes have a limit
-of their own (processes.py).
+A thread checks regularly whether the same call is still running. If it takes too long, a signal interrupts
+it: the signal's handler raises in the main thread, where the environment runs. This works wherever Python can
+be interrupted: sleeping, waiting, computing in Python. Compiled code that never returns cannot be stopped
+from inside its process; then a line on stderr names it. Worker processes have their own limit (processes.py).
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import weakref
 from collections.abc import Callable
 from typing import Any
 
-from tightrope.control.environments.faults import Overdue
+from tightrope.control.environments.faults import EnvironmentTimeout
 
 SIGNAL = getattr(signal, "SIGALRM", None)  # none on Windows: no limit in this process there
 _watching: list[Watchdog] = []  # training's and evaluation's, under one handler
@@ -26,9 +25,9 @@ _watching: list[Watchdog] = []  # training's and evaluation's, under one handler
 class Watchdog:
     """Watches the method ``under_way() -> a number that changes with every call, None when there is none``.
 
-    It begins with `start` and ends with `stop`, or with the object that the method belongs to; ``name`` is
-    for the line about what cannot be interrupted.
-    Nothing is watched outside the main thread, or where somebody else handles the signal.
+    It begins with `start` and ends with `stop`, or when the object of the method is deleted. ``name`` appears
+    in the message about a call that cannot be interrupted.
+    It does nothing outside the main thread, or where other code handles the signal.
     """
 
     def __init__(self, under_way: Callable[[], int | None], timeout: float, name: str) -> None:
@@ -90,10 +89,10 @@ class Watchdog:
         return None if under_way is None else under_way()
 
     def interrupt(self) -> None:
-        """Raise Overdue in the main thread, unless the call came back in the meantime."""
+        """Raise EnvironmentTimeout in the main thread, unless the call came back in the meantime."""
         late, self._late = self._late, None
         if late is not None and late == self._now():
-            raise Overdue(f"not back after {self._timeout:g} s (env_timeout)")
+            raise EnvironmentTimeout(f"not back after {self._timeout:g} s (env_timeout)")
 
 
 def _interrupt(number: int, frame: Any) -> None:

@@ -37,8 +37,8 @@ class Distribution:
     mask: Tensor | None = None
     half_range: Tensor | None = None
 
-    def sample(self, noise: Tensor) -> Tensor:
-        """Actions [N, A] made of the given noise [N, A]."""
+    def sample(self, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [N, A] made of the given noise [N, A], and their log-probabilities [N]."""
         parts = []
         for component in self.layout.components:
             u = noise[:, component.column : component.column + component.width]
@@ -49,7 +49,8 @@ class Distribution:
                 parts.append((u < torch.sigmoid(self._logits(component))).float())
             else:
                 parts.append(_inverse_cdf(self._logits(component), u[:, 0])[:, None].float())
-        return torch.cat(parts, dim=1)
+        actions = torch.cat(parts, dim=1)
+        return actions, self.logp(actions)
 
     def mode(self) -> Tensor:
         """The most likely action [N, A] (Gaussian: the mean, squashed or not)."""
@@ -110,23 +111,13 @@ class Distribution:
     def _gaussian(self, component: Component) -> tuple[Tensor, Tensor]:
         mean = self.parameters[:, component.parameter : component.parameter + component.count]
         assert self.log_std is not None
-        start = _gaussian_offset(self.layout, component)
+        start = component.deviation
         return mean, self.log_std[..., start : start + component.count].clamp(*LOG_STD_RANGE)
 
     def _half_range(self, component: Component) -> Tensor:
         assert self.half_range is not None
-        start = _gaussian_offset(self.layout, component)
+        start = component.deviation
         return self.half_range[start : start + component.count]
-
-
-def gaussian_dimensions(layout: ActionLayout) -> int:
-    """How many Gaussian columns the layout has in all."""
-    return sum(c.count for c in layout.components if c.kind == "gaussian")
-
-
-def _gaussian_offset(layout: ActionLayout, component: Component) -> int:
-    earlier = (c for c in layout.components if c.kind == "gaussian" and c.column < component.column)
-    return sum(c.count for c in earlier)
 
 
 def _inverse_cdf(logits: Tensor, u: Tensor) -> Tensor:

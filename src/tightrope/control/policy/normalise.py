@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from tightrope.control.spaces import Array, Inputs
 from tightrope.maths.statistics import RunningMoments
 
-Array = np.ndarray
 CLIP = 10.0
 
 
@@ -35,16 +35,16 @@ class ObservationNormaliser:
         return np.clip((flat - self.mean) * self.inverse_std, -CLIP, CLIP)
 
     def update(self, flat: Array) -> None:
-        """Take in the raw observations [N, D] of a rollout that has been learned from."""
+        """Add the raw observations [N, D] of a rollout that has been learned from."""
         self.moments = self.moments.update(torch.from_numpy(flat))
         self._freeze()
 
     def state(self) -> dict[str, torch.Tensor]:
         """Tensors to save."""
-        return {"count": self.moments.count, "mean": self.moments.mean, "variance": self.moments.variance}
+        return dict(vars(self.moments))
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
-        """Take over saved tensors."""
+        """Load saved tensors."""
         self.moments = RunningMoments(state["count"], state["mean"], state["variance"])
         self._freeze()
 
@@ -53,7 +53,7 @@ class RewardNormaliser:
     """r / sqrt(Var(R) + 1e-8), clipped to +-10, where R_t = r_t + gamma R_{t-1} restarts after either kind of
     end.
 
-    The mean is not subtracted: that would change which policy is best. ``deviation`` is the scale in force.
+    The mean is not subtracted: that would change which policy is best. ``deviation`` is the present scale.
     """
 
     def __init__(self, num_envs: int, gamma: float) -> None:
@@ -70,7 +70,7 @@ class RewardNormaliser:
         return np.clip(rewards / self.deviation, -CLIP, CLIP).astype(np.float32)
 
     def update(self, rewards: Array, ended: Array, mask: Array) -> None:
-        """Take in the raw rewards [B, T] of a rollout; masked steps do not exist."""
+        """Add the raw rewards [B, T] of a rollout; masked steps do not exist."""
         series = np.empty_like(rewards)
         for t in range(rewards.shape[1]):
             stepped = self.running * self.gamma + rewards[:, t]
@@ -84,38 +84,36 @@ class RewardNormaliser:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Tensors to save."""
-        running = torch.from_numpy(self.running.copy())
-        moments = self.moments
-        return {
-            "count": moments.count,
-            "mean": moments.mean,
-            "variance": moments.variance,
-            "running": running,
-        }
+        return {**vars(self.moments), "running": torch.from_numpy(self.running.copy())}
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
-        """Take over saved tensors."""
+        """Load saved tensors."""
         self.moments = RunningMoments(state["count"], state["mean"], state["variance"])
         self.running = state["running"].numpy().copy()
 
 
 class Normalisers:
-    """Both kinds, each present only when its setting is on; one object to save, freeze and hand around."""
+    """Both normalisers; None for one whose setting is off."""
 
     def __init__(self, observations: ObservationNormaliser | None, rewards: RewardNormaliser | None) -> None:
         self.observations, self.rewards = observations, rewards
 
-    def encode(self, inputs: dict[str, Array]) -> dict[str, Array]:
-        """Raw inputs to what the networks see."""
+    def encode(self, inputs: Inputs) -> Inputs:
+        """Raw inputs as the networks see them."""
         if self.observations is None or "flat" not in inputs:
             return inputs
         return {**inputs, "flat": self.observations(inputs["flat"])}
 
-    def start(self, rollout: Any) -> None:
-        """Give the reward normaliser its first statistics: the first rollout is scaled by its own."""
-        if self.rewards is not None and float(self.rewards.moments.count) == 0:
+    def scaled_rewards(self, rollout: Any) -> Array:
+        """The rewards of a rollout to learn from, float32. The first rollout of all is scaled by its own
+        statistics: there are no others.
+        """
+        if self.rewards is None:
+            return rollout.rewards.astype(np.float32)
+        if float(self.rewards.moments.count) == 0:
             self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
             rollout.reward_statistics_taken = True
+        return self.rewards(rollout.rewards)
 
     def update(self, rollout: Any) -> None:
         """Move the statistics, after the update on this rollout."""
@@ -132,7 +130,7 @@ class Normalisers:
         }
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
-        """Take over what ``state`` gave. ValueError for statistics of other observations: the compiled engine
+        """Load a `state`. ValueError for statistics of other observations: the compiled engine
         would read beyond them.
         """
         for kind, part in {"observations": self.observations, "rewards": self.rewards}.items():

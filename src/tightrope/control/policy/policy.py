@@ -13,12 +13,17 @@ from gymnasium.spaces import Box
 from torch import Tensor, nn
 
 from tightrope.algorithms.batch import Batch, Evaluation
-from tightrope.control.policy.distributions import Distribution, gaussian_dimensions
+from tightrope.control.policy.distributions import Distribution
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import ActionLayout, ObservationLayout
+from tightrope.control.spaces import ActionLayout, Inputs, ObservationLayout
 
-Inputs = dict[str, Tensor]
-ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
+InputTensors = dict[str, Tensor]
+ACTIVATION_LAYERS: dict[str, type[nn.Module]] = {
+    "tanh": nn.Tanh,
+    "relu": nn.ReLU,
+    "elu": nn.ELU,
+    "silu": nn.SiLU,
+}
 
 
 def mlp(
@@ -34,7 +39,7 @@ def mlp(
         final = last_gain is not None and i == len(sizes) - 2
         layers.append(_orthogonal(nn.Linear(n_in, n_out), last_gain if final else math.sqrt(2.0), generator))
         if not final:
-            layers.append(ACTIVATIONS[activation]())
+            layers.append(ACTIVATION_LAYERS[activation]())
     return nn.Sequential(*layers)
 
 
@@ -95,7 +100,7 @@ class Policy(nn.Module):
         super().__init__()
         self.observation_layout, self.layout, self.std = observations, actions, settings.std
         generator = torch.Generator().manual_seed(settings.seed)
-        dimensions = gaussian_dimensions(actions)
+        dimensions = int(actions.gaussian.sum())
         self.own = _own_module(own, observations, actions)
         self.encoders = nn.ModuleList(ImageEncoder(s, generator) for s in observations.image_shapes)
         size = observations.size + 512 * len(observations.image_shapes)
@@ -131,9 +136,10 @@ class Policy(nn.Module):
         """Where the parameters lie."""
         return next(self.parameters()).device
 
-    def tensors(self, arrays: dict[str, np.ndarray]) -> Inputs:
+    def _tensors(self, arrays: Inputs) -> InputTensors:
         """Encoded observations as tensors where the parameters lie."""
-        return {name: torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for name, x in arrays.items()}
+        device = self.device
+        return {name: torch.from_numpy(np.ascontiguousarray(x)).to(device) for name, x in arrays.items()}
 
     def critic_parameters(self) -> list[nn.Parameter]:
         """The parameters that only the critic uses; empty for a user's own module."""
@@ -147,7 +153,7 @@ class Policy(nn.Module):
         logp = distribution.logp(batch.actions.reshape(shape[0] * shape[1], -1))
         return Evaluation(logp.view(shape), distribution.entropy().view(shape), values.view(shape))
 
-    def evaluate(self, inputs: Inputs) -> tuple[Distribution, Tensor]:
+    def evaluate(self, inputs: InputTensors) -> tuple[Distribution, Tensor]:
         """Distribution and values [N] of encoded observations [N, ...]."""
         if self.own is not None:
             parameters, values = self._own_outputs(inputs)
@@ -158,14 +164,16 @@ class Policy(nn.Module):
         parameters = self.actor[-1](latent)
         return self._distribution(parameters, latent, inputs), self.critic(features)[:, 0]
 
-    def values(self, inputs: Inputs) -> Tensor:
-        """Values [N] alone."""
+    @torch.no_grad()
+    def values(self, arrays: Inputs) -> Tensor:
+        """Only the values [N] of encoded observations [N, ...]."""
+        inputs = self._tensors(arrays)
         if self.own is not None:
             return self._own_outputs(inputs)[1]
         assert self.critic is not None
         return self.critic(self.features(inputs))[:, 0]
 
-    def features(self, inputs: Inputs) -> Tensor:
+    def features(self, inputs: InputTensors) -> Tensor:
         """What actor and critic both start from: flat inputs and image features, through the trunk."""
         parts = [inputs["flat"]] if self.observation_layout.size else []
         parts += [encoder(inputs[f"image{i}"]) for i, encoder in enumerate(self.encoders)]
@@ -173,34 +181,35 @@ class Policy(nn.Module):
         return self.trunk(x) if self.trunk is not None else x
 
     @torch.no_grad()
-    def act(self, inputs: Inputs, noise: Tensor, rows: slice = slice(None)) -> tuple[Tensor, Tensor]:
-        """Sampled actions [N, A] and their log-probabilities [N]; with gSDE the held exploration makes the
-        noise.
+    def act(self, arrays: Inputs, noise: np.ndarray, rows: slice = slice(None)) -> tuple[Tensor, Tensor]:
+        """Sampled actions [N, A] and their log-probabilities [N], from encoded observations and noise [N, A].
+
+        With gSDE the held exploration of these rows makes the noise of Gaussian columns.
         """
-        distribution, latent = self._actor(inputs)
+        distribution, latent = self._actor(self._tensors(arrays))
+        random = torch.from_numpy(noise).to(self.device)
         if self.gsde and self.exploration is not None:
             assert latent is not None and self.log_std is not None and distribution.log_std is not None
             held = torch.einsum(
                 "nf,nfd->nd", latent, self.exploration[rows] * self.log_std.clamp(-20, 2).exp()
             )
-            noise = noise.clone()
-            noise[:, self._gaussian_columns()] = held * (-distribution.log_std).exp()
-        actions = distribution.sample(noise)
-        return actions, distribution.logp(actions)
+            random = random.clone()
+            random[:, self.layout.gaussian] = held * (-distribution.log_std).exp()
+        return distribution.sample(random)
 
-    def sample(self, inputs: Inputs, noise: Tensor, rng: np.random.Generator) -> Tensor:
+    def sample(self, arrays: Inputs, noise: np.ndarray, rng: np.random.Generator) -> Tensor:
         """Sampled actions [N, A] outside a rollout: fresh exploration, and the held one is left as it is."""
         held = self.exploration
         self.hold_exploration(len(noise), rng)
         try:
-            return self.act(inputs, noise)[0]
+            return self.act(arrays, noise)[0]
         finally:
             self.exploration = held
 
     @torch.no_grad()
-    def mode(self, inputs: Inputs) -> Tensor:
+    def mode(self, arrays: Inputs) -> Tensor:
         """The most likely actions [N, A]."""
-        return self._actor(inputs)[0].mode()
+        return self._actor(self._tensors(arrays))[0].mode()
 
     def hold_exploration(self, num_envs: int, rng: np.random.Generator) -> None:
         """Draw the gSDE matrices [num_envs, features, d] that are held for the next ``gsde_steps`` steps."""
@@ -209,14 +218,14 @@ class Policy(nn.Module):
             draws = rng.standard_normal((num_envs, *self.log_std.shape), dtype=np.float32)
             self.exploration = torch.from_numpy(draws).to(self.device)
 
-    def _actor(self, inputs: Inputs) -> tuple[Distribution, Tensor | None]:
+    def _actor(self, inputs: InputTensors) -> tuple[Distribution, Tensor | None]:
         if self.own is not None:
             return self._distribution(self._own_outputs(inputs)[0], None, inputs), None
         assert self.actor is not None
         latent = self.actor[:-1](self.features(inputs))
         return self._distribution(self.actor[-1](latent), latent, inputs), latent
 
-    def _distribution(self, parameters: Tensor, latent: Tensor | None, inputs: Inputs) -> Distribution:
+    def _distribution(self, parameters: Tensor, latent: Tensor | None, inputs: InputTensors) -> Distribution:
         log_std: Tensor | None = self.log_std
         if self.std == "state" and parameters.shape[1] > self.layout.num_parameters:
             log_std = parameters[:, self.layout.num_parameters :] + self.log_std_init
@@ -229,17 +238,13 @@ class Policy(nn.Module):
             log_std = 0.5 * torch.log(variance + 1e-6)
         return Distribution(self.layout, parameters, log_std, inputs.get("action_mask"), self.half_range)
 
-    def _gaussian_columns(self) -> list[int]:
-        gaussians = [c for c in self.layout.components if c.kind == "gaussian"]
-        return [column for c in gaussians for column in range(c.column, c.column + c.count)]
-
-    def _own_outputs(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+    def _own_outputs(self, inputs: InputTensors) -> tuple[Tensor, Tensor]:
         assert self.own is not None
         result = self.own(self.observation_layout.unflatten(inputs))
         n = next(iter(inputs.values())).shape[0]
         expected = self.layout.num_parameters
         if self.std == "state":
-            expected += gaussian_dimensions(self.layout)
+            expected += int(self.layout.gaussian.sum())
         good = isinstance(result, tuple) and len(result) == 2 and all(isinstance(x, Tensor) for x in result)
         if not good or result[0].shape != (n, expected) or result[1].numel() != n:
             seen = (

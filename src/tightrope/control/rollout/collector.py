@@ -6,17 +6,25 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from torch import nn
 
-from tightrope.control.engine.base import Engine
+from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
+from tightrope.control.engine.base import Acted, Engine
 from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments
+from tightrope.control.environments.faults import action_text, circumstances
 from tightrope.control.policy.normalise import Normalisers
-from tightrope.control.rollout.rollout import Array, Rollout, check_numbers, check_policy
-from tightrope.control.spaces import Inputs
+from tightrope.control.rollout.rollout import Rollout
+from tightrope.control.spaces import Array, Inputs
+from tightrope.errors import TightropeError
+
+
+class BadNumbers(TightropeError, ValueError):
+    """An environment returned a NaN or an infinity; nothing was learned from it."""
 
 
 def reset_seed(seed: int, step: int) -> int:
-    """The seed of a reset at an agent step; at step 0 the run's own. Single environment i adds i."""
+    """The seed of a reset at an agent step; at step 0 that of the run. Single environment i adds i."""
     if step == 0:
         return seed
     return int(np.random.SeedSequence([seed, step]).generate_state(1)[0]) >> 2  # with i it fits 31 bits
@@ -32,9 +40,7 @@ class Collector:
         self.normalisers = normalisers
         self.rng = rng
         self._rollout: Rollout | None = None
-        self._uniform = np.concatenate(  # bool [A]: columns whose noise is uniform, not normal
-            [np.full(c.width, c.kind != "gaussian") for c in environments.action_layout.components]
-        )
+        self._uniform = ~environments.action_layout.gaussian  # bool [A]: columns of uniform noise
         self._step_count = 0
         self._column = 0  # the step of the rollout that is under way
         self._restarts = 0  # those that earlier rollouts reported
@@ -51,11 +57,11 @@ class Collector:
             self.normalisers.rewards.restart(self.environments.num_envs)
 
     def state(self) -> dict[str, Any] | None:
-        """The running episodes, as JSON can hold them; None when the environments cannot give their state."""
+        """The running episodes as JSON; None when the environments cannot give their state."""
         if not self.environments.gives_state:
             return None
         names = ("_inputs", "_action_mask", "_returns", "_lengths")
-        episodes = {name: states.pack(getattr(self, name)) for name in names}
+        episodes = {name: states.encode(getattr(self, name)) for name in names}
         return {**episodes, "environments": self.environments.get_state()}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -67,7 +73,7 @@ class Collector:
         zeros = np.zeros(self.environments.num_envs)
         like = {"_inputs": inputs, "_action_mask": action_mask, "_returns": zeros}
         for name, fresh in {**like, "_lengths": zeros.astype(np.int64)}.items():
-            found = states.unpack(state[name])
+            found = states.decode(state[name])
             if not states.alike(found, fresh):  # the compiled engine would read beyond it
                 raise ValueError(f"{name.strip('_')} of the episodes have another shape than here")
             setattr(self, name, found)
@@ -92,8 +98,7 @@ class Collector:
     def collect(self, engine: Engine, num_steps: int) -> Rollout:
         """Step all environments ``num_steps`` times with the engine's policy.
 
-        The next call reuses the arrays of the rollout that it returns. The first rollout of all also starts
-        the reward normaliser, which has nothing else to scale it by.
+        The next call reuses the arrays of the rollout that it returns.
         """
         rollout = self._cleared(num_steps)
         try:
@@ -112,7 +117,6 @@ class Collector:
             self._restarts = self.environments.restarts
         rollout.episodes = self._count_episodes(rollout)
         self._step_count += num_steps
-        self.normalisers.start(rollout)
         return rollout
 
     def _cleared(self, num_steps: int) -> Rollout:
@@ -138,7 +142,8 @@ class Collector:
             if normaliser is not None:
                 rollout.raw[:, t] = inputs["flat"]
             for rows in environments.row_groups:
-                out = rollout.acted(rows, t)
+                seen = {name: x[rows, t] for name, x in rollout.inputs.items()}
+                out = Acted(seen, rollout.actions[rows, t], rollout.logp[rows, t])
                 engine.act(inputs, normaliser, action_mask, noise[t], rows, out)
                 environments.send(rows, out.actions)
             before = perf_counter()
@@ -160,8 +165,55 @@ class Collector:
         return inputs
 
     def _check(self, rollout: Rollout, engine: Engine, num_steps: int, last: Inputs) -> None:
-        check_numbers(rollout, self.environments, last, num_steps, self._step_count)
-        check_policy(rollout, engine.policy, num_steps, self._step_count)
+        self._check_numbers(rollout, num_steps, last)
+        self._check_policy(rollout, engine.policy, num_steps)
+
+    def _check_numbers(self, rollout: Rollout, num_steps: int, last: Inputs) -> None:
+        """Raise BadNumbers for the first NaN or infinity of an environment in ``num_steps`` columns.
+
+        ``last``: observations after the last step, not normalised.
+        """
+        environments, first_step = self.environments, self._step_count
+        rows = np.arange(len(rollout.logp))
+        # what, numbers [N, t, k], their rows, the step of the first, the column of the action that led there
+        checks = [("observation", rollout.raw[:, :num_steps], rows, first_step, -1)]
+        checks.append(("reward", rollout.rewards[:, :num_steps, None], rows, first_step, 0))
+        if "flat" in last:
+            checks.append(("observation", last["flat"][:, None], rows, first_step + num_steps, num_steps - 1))
+        for t, final_rows, x in rollout.finals:
+            if "flat" in x:
+                checks.append(("final observation", x["flat"][:, None], final_rows, first_step + t + 1, t))
+        for what, numbers, which, first, column in checks:
+            good = np.isfinite(numbers)
+            if good.all():
+                continue
+            place, t, index = np.argwhere(~good)[0]
+            row = int(which[place])
+            where = f"step {first + t}" + ("" if what == "reward" else f", index {index}")
+            action = None
+            if column + t >= 0:
+                chosen = rollout.actions[row, column + t]
+                action = action_text(environments.action_layout.to_env_single(chosen, environments.squash))
+            raise BadNumbers(
+                f"Environment {row} of {environments.spec_id} returned {what} = {numbers[place, t, index]} "
+                f"at {where}{circumstances(environments.worker_of(row), environments.seed_of(row), action)}; "
+                "expected finite numbers. The policy was not updated with it. Fix the environment, or clip "
+                "and check its state there; --on-env-fault restart restarts it and continues."
+            )
+
+    def _check_policy(self, rollout: Rollout, policy: nn.Module, num_steps: int) -> None:
+        """NonFiniteError when the policy gave a log-probability that is not finite; a bad weight is named."""
+        bad = ~np.isfinite(rollout.logp[:, :num_steps])
+        if not bad.any():
+            return
+        row, t = np.argwhere(bad)[0]
+        weight = first_bad((f"the weight {name}", p) for name, p in policy.named_parameters())
+        raise NonFiniteError(
+            f"The policy gave the log-probability {rollout.logp[row, t]} to its action in environment {row} "
+            f"at step {self._step_count + t}; expected a finite number"
+            + (f", but {weight}. " if weight else ": its logits overflow. ")
+            + "It was not updated with this rollout. Look for a learning rate that is too high."
+        )
 
     def _count_episodes(self, rollout: Rollout) -> list[tuple[float, int, bool]]:
         """(return, length, terminated) of every episode that ended in the rollout, by column.

@@ -1,22 +1,16 @@
-"""The arrays of a rollout, and the checks that they pass before anything is learned from them."""
+"""A rollout, and the Batch that update rules learn from: values, advantages, returns."""
 
 from __future__ import annotations
 
 import numpy as np
-from torch import nn
+import torch
 
-from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
-from tightrope.control.engine.base import Acted
+from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
+from tightrope.control.engine.base import Engine, Steps
 from tightrope.control.environments.base import Environments
-from tightrope.control.environments.faults import action_text, circumstances
-from tightrope.control.spaces import Inputs
-from tightrope.errors import TightropeError
-
-Array = np.ndarray
-
-
-class BadNumbers(TightropeError, ValueError):
-    """An environment returned a NaN or an infinity; nothing was learned from it."""
+from tightrope.control.policy.normalise import Normalisers
+from tightrope.control.spaces import Array, Inputs
 
 
 class Rollout:
@@ -26,7 +20,7 @@ class Rollout:
     which an environment failed and was restarted; its input is the last observation of the episode that was
     cut, from whose value the step before it is bootstrapped.
 
-    ``inputs``: what the policy saw (normalised). ``raw``: flat observations, and ``rewards``, as they came.
+    ``inputs``: what the policy saw (normalised). ``raw``: flat observations, and ``rewards``, unchanged.
     ``last``: encoded observation after the last step. ``finals``: (column, rows, encoded true final
     observations) of truncated episodes whose next row already belongs to a new episode.
     """
@@ -73,60 +67,61 @@ class Rollout:
         self.finals = []
         self.reward_statistics_taken = False
 
-    def acted(self, rows: slice, t: int) -> Acted:
-        """Where an engine writes what it does in ``rows`` at step ``t``."""
-        inputs = {name: x[rows, t] for name, x in self.inputs.items()}
-        return Acted(inputs, self.actions[rows, t], self.logp[rows, t])
 
+def to_batch(rollout: Rollout, engine: Engine, normalisers: Normalisers, settings: UpdateSettings) -> Batch:
+    """Values, advantages and returns of a rollout, as a Batch [B, T]."""
+    rewards = normalisers.scaled_rewards(rollout)
+    values, following = critic_values(rollout, engine)
+    mask = rollout.mask
+    if isinstance(settings, ReinforceSettings) and not settings.baseline:
+        mask = mask & finished(rollout.ended, mask)
+        values = np.zeros_like(values)
+        following = np.zeros_like(values)
+    steps = Steps(rewards, values, following, rollout.terminated, rollout.ended, mask)
+    advantages = engine.gae(steps, settings.gamma, settings.gae_lambda)
 
-# --------------------------------------------------------------------------------------------------- checks
+    def tensor(array: Array) -> torch.Tensor:
+        return torch.from_numpy(array).to(engine.device)
 
-
-def check_numbers(
-    rollout: Rollout, environments: Environments, last: Inputs, num_steps: int, first_step: int
-) -> None:
-    """Raise BadNumbers for the first NaN or infinity that an environment returned in ``num_steps`` columns.
-
-    ``last``: observations after the last step, as they came. ``first_step``: number of the first column.
-    """
-    rows = np.arange(len(rollout.logp))
-    # what, numbers [N, t, k], their rows, the step of the first, the column of the action that led there
-    checks = [("observation", rollout.raw[:, :num_steps], rows, first_step, -1)]
-    checks.append(("reward", rollout.rewards[:, :num_steps, None], rows, first_step, 0))
-    if "flat" in last:
-        checks.append(("observation", last["flat"][:, None], rows, first_step + num_steps, num_steps - 1))
-    for t, final_rows, x in rollout.finals:
-        if "flat" in x:
-            checks.append(("final observation", x["flat"][:, None], final_rows, first_step + t + 1, t))
-    for what, numbers, which, first, column in checks:
-        good = np.isfinite(numbers)
-        if good.all():
-            continue
-        place, t, index = np.argwhere(~good)[0]
-        row = int(which[place])
-        where = f"step {first + t}" + ("" if what == "reward" else f", index {index}")
-        action = None
-        if column + t >= 0:
-            chosen = rollout.actions[row, column + t]
-            action = action_text(environments.action_layout.to_env_single(chosen, environments.squash))
-        raise BadNumbers(
-            f"Environment {row} of {environments.spec_id} returned {what} = {numbers[place, t, index]} at "
-            f"{where}{circumstances(environments.worker_of(row), environments.seed_of(row), action)}; "
-            "expected finite numbers. The policy was not updated with it. Fix the environment, or clip and "
-            "check its state there; --on-env-fault restart restarts it and continues."
-        )
-
-
-def check_policy(rollout: Rollout, policy: nn.Module, num_steps: int, first_step: int) -> None:
-    """NonFiniteError when the policy gave a log-probability that is not finite; a bad weight is named."""
-    bad = ~np.isfinite(rollout.logp[:, :num_steps])
-    if not bad.any():
-        return
-    row, t = np.argwhere(bad)[0]
-    weight = first_bad((f"the weight {name}", p) for name, p in policy.named_parameters())
-    raise NonFiniteError(
-        f"The policy gave the log-probability {rollout.logp[row, t]} to its action in environment {row} at "
-        f"step {first_step + t}; expected a finite number"
-        + (f", but {weight}. " if weight else ": its logits overflow. ")
-        + "It was not updated with this rollout. Look for a learning rate that is too high."
+    return Batch(
+        inputs={name: tensor(x) for name, x in rollout.inputs.items()},
+        actions=tensor(rollout.actions),
+        old_logp=tensor(rollout.logp),
+        old_values=tensor(values),
+        advantages=tensor(advantages),
+        returns=tensor(advantages + values),
+        mask=tensor(mask),
     )
+
+
+def critic_values(rollout: Rollout, engine: Engine) -> tuple[Array, Array]:
+    """V of every observation, and of the true next observation of every step, both [B, T].
+
+    The second differs from a shift of the first at the end of the rollout and at truncations.
+    """
+    observed = {name: x.reshape(-1, *x.shape[2:]) for name, x in rollout.inputs.items()}
+    finals = [inputs for _, _, inputs in rollout.finals]
+    groups = [observed, rollout.last]
+    if finals:
+        groups.append({name: np.concatenate([x[name] for x in finals]) for name in finals[0]})
+    values, last_values, *final_values = [engine.values(group) for group in groups]
+    values = values.reshape(rollout.logp.shape)
+    following = np.concatenate([values[:, 1:], last_values[:, None]], axis=1)
+    if finals:
+        rows = np.concatenate([rows for _, rows, _ in rollout.finals])
+        columns = np.concatenate([np.full(len(rows), t) for t, rows, _ in rollout.finals])
+        following[rows, columns] = final_values[0]
+    return values, following
+
+
+def finished(ended: Array, mask: Array) -> Array:
+    """True [B, T] for steps whose episode ends inside the rollout, other than by a fault that cut it.
+
+    A fault is ``ended`` where ``mask`` is False.
+    """
+    found = np.zeros_like(ended)
+    complete = np.zeros(len(ended), bool)
+    for t in range(ended.shape[1] - 1, -1, -1):
+        complete = np.where(ended[:, t], mask[:, t], complete)
+        found[:, t] = complete
+    return found

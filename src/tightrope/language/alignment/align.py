@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.language.alignment.iteration import Trainer
-from tightrope.language.alignment.kl import bias_of
-from tightrope.language.quiet import quiet
-from tightrope.language.settings import AlignSettings
+from tightrope.language.quiet import quiet_libraries
+from tightrope.language.settings import AlignSettings, recorded
 from tightrope.language.supervised.prepare import threads
 from tightrope.runs.records import retyped
 from tightrope.runs.run import Run
@@ -41,7 +40,7 @@ class Aligned:
         return self.path / "model"
 
 
-@quiet()
+@quiet_libraries()
 def align(
     settings: AlignSettings | None = None,
     *,
@@ -60,28 +59,27 @@ def align(
     Everything else is a field of AlignSettings or RLHFSettings. Raises ValueError for what cannot work,
     before anything is trained.
     """
-    settings = (settings or AlignSettings()).with_values(**_named(prompts, reward, gold), **values)
-    told = Listeners(listeners)
+    settings = (settings or AlignSettings()).with_values(**values)
+    settings = recorded(settings, data=prompts, reward=reward, gold=gold)
+    events = Listeners(listeners)
     for risk in settings.risks():
-        told.warn(risk)
-    if (bias := bias_of(settings.kl)) is not None:
-        told.warn(f"{bias}.")
+        events.warn(risk)
     require_tensorboard(settings.tensorboard)
     with threads(settings.threads):
-        trainer = _trainer(settings, prompts, reward, gold, told)
+        trainer = _trainer(settings, prompts, reward, gold, events)
         name = f"align-{Path(settings.model).name}-{settings.seed}"
         with Run.create(run_dir, trainer.settings.to_json(), name) as run:
             return _train(trainer, run)
 
 
-def _trainer(settings: AlignSettings, prompts: Any, reward: Any, gold: Any, told: Listeners) -> Trainer:
+def _trainer(settings: AlignSettings, prompts: Any, reward: Any, gold: Any, events: Listeners) -> Trainer:
     """A trainer on what was given, and on what the settings name where nothing was."""
     return Trainer(
         settings,
         settings.data if prompts is None else prompts,
         settings.reward if reward is None else reward,
         settings.gold if gold is None else gold,
-        told,
+        events,
     )
 
 
@@ -90,22 +88,7 @@ def _train(trainer: Trainer, run: Run) -> Aligned:
     return Aligned(run.path, summary, run.read_metrics())
 
 
-def _named(prompts: Any, reward: Any, gold: Any) -> dict[str, str]:
-    """What settings.json says of objects that were given in Python: their names in angle brackets, for
-    display alone, so that none is taken for a file, a folder or a reward that this package knows.
-    """
-    found = {}
-    for name, value in (("data", prompts), ("reward", reward), ("gold", gold)):
-        if value is not None:
-            found[name] = (
-                str(value)
-                if isinstance(value, str | Path)
-                else f"<{getattr(value, '__name__', type(value).__name__).strip('<>')}>"
-            )
-    return found
-
-
-@quiet()
+@quiet_libraries()
 def resume_align(
     run_dir: str | Path,
     *,
@@ -115,11 +98,11 @@ def resume_align(
     total_episodes: int | None = None,
     listeners: Sequence[Listener] = (),
 ) -> Aligned:
-    """Go on from a run's newest checkpoint, or from the start where there is none yet; the end is that of a
-    run without a break, bit for bit.
+    """Continue from a run's newest checkpoint, or from the start where there is none yet. It ends like an
+    uninterrupted run, bit for bit.
 
-    Code is never named by a file: a reward that was a function must be given again, and prompts that were no
-    file too. ``total_episodes`` extends a finished run.
+    Code is never named by a file: a reward that was a function must be given again, and so must prompts that
+    were no file. ``total_episodes`` extends a finished run.
     """
     with Run.open(run_dir, own=True) as run:
         settings = AlignSettings.from_json(run.settings, run.path / "settings.json")
@@ -146,7 +129,7 @@ def _require_what_no_file_gives(
             )
     if prompts is None and not Path(settings.data).is_file():
         raise ValueError(
-            f"The prompts of {run_dir} were {settings.data!r}, which is no file. Give them again: "
+            f"The prompts of {run_dir} were {settings.data!r}, which is not a file. Give them again: "
             f"tightrope resume {shlex.quote(str(run_dir))} --data PROMPTS.jsonl"
         )
 
@@ -163,7 +146,9 @@ def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
             f"many or more, got {total_episodes:,}."
         )
     if point is not None and trainer.episodes >= settings.total_episodes:
-        text = f"{run.path} has its {trainer.episodes:,} responses; --total-episodes N goes on from there."
+        text = f"{run.path} has its {trainer.episodes:,} responses; --total-episodes N continues from there."
         trainer.listeners.info(text)
-    trainer.stopped = trainer.stopped and total_episodes is None  # who gives a new end wants to go on
+    trainer.stopped = (
+        trainer.stopped and total_episodes is None
+    )  # a new end means that the user wants to continue
     continue_from(trainer, run, point)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,9 @@ from tightrope.algorithms.memory import OutOfMemory, free, is_out_of_memory
 from tightrope.language.alignment.kl import kl_rewards
 from tightrope.language.data.batching import length_groups, pad_left
 from tightrope.language.data.examples import Prompt
-from tightrope.language.generation.distribution import token_statistics
 from tightrope.language.generation.sample import Completions, sample
 from tightrope.language.policy.roles import Roles
-from tightrope.language.policy.rollout import Experience, FirstPass, Inputs
+from tightrope.language.policy.rollout import Experience, FirstPass, ResponseInputs
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings
 from tightrope.maths import returns
@@ -44,31 +43,44 @@ class PromptOrder:
         return taken
 
 
+@contextlib.contextmanager
+def _advice_on_memory(roles: Roles) -> Iterator[None]:
+    """Inside, an error of memory becomes an OutOfMemory that names the settings to lower."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if isinstance(error, OutOfMemory) or not is_out_of_memory(error):
+            raise
+        reason = (str(error).splitlines() or [""])[0][:200]
+        raise OutOfMemory(
+            f"Memory is not enough to sample {roles.settings.batch_size} responses at once ({reason}). "
+            "Choose a smaller --batch-size, --max-new-tokens or --max-prompt-tokens; --micro-batch-size "
+            "makes the pass over the finished responses smaller."
+        ) from error
+
+
 def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Completions:
     """``samples`` responses of the policy to each prompt; rows of one prompt are neighbours.
 
     Raises OutOfMemory, with advice.
     """
-    try:
-        return _respond(roles, prompts, seed, iteration, samples)
-    except (RuntimeError, MemoryError) as error:
-        _advise_on_memory(roles, error)
-        raise
-
-
-def _respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Completions:
     settings, begin = roles.settings, time.perf_counter()
     device = next(roles.model.parameters()).device
     tokens, real = (x.to(device) for x in pad_left([prompt.tokens for prompt in prompts]))
     shape = len(prompts) * samples, settings.max_new_tokens
     uniforms = torch.from_numpy(np.random.default_rng([seed, 8, iteration]).random(shape)).to(device)
-    with roles.frozen_policy():
-        responses = sample(
-            roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples
+    with _advice_on_memory(roles):
+        with roles.frozen_policy():
+            responses = sample(
+                roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples
+            )
+        return Completions(
+            tokens=torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1),
+            real=torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1),
+            responses=responses,
+            ids=[row[mask].tolist() for row, mask in zip(responses.tokens, responses.mask, strict=True)],
+            seconds=time.perf_counter() - begin,
         )
-    tokens = torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1)
-    real = torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1)
-    return Completions(tokens, real, responses, time.perf_counter() - begin, lower=None)
 
 
 def gather(
@@ -81,6 +93,7 @@ def gather(
     when memory runs out without ``keep`` as well.
     """
     answers = respond(roles, prompts, seed, iteration, samples)
+    short = False
     if keep and len(length_groups(answers.real, answers.responses.mask)) == 1:
         try:
             return _evaluated(roles, answers, keep=True)
@@ -89,31 +102,18 @@ def gather(
                 raise
         # outside the except clause, which keeps the failed pass's tensors alive
         free()
-        return dataclasses.replace(_evaluated(roles, answers), short_of_memory=True)
-    try:
-        return _evaluated(roles, answers)
-    except (RuntimeError, MemoryError) as error:
-        _advise_on_memory(roles, error)
-        raise
+        short = True
+    with _advice_on_memory(roles):
+        return _evaluated(roles, answers, short_of_memory=short)
 
 
-def _advise_on_memory(roles: Roles, error: RuntimeError | MemoryError) -> None:
-    """OutOfMemory, which names the settings to lower, for an error that is one of memory."""
-    if isinstance(error, OutOfMemory) or not is_out_of_memory(error):
-        return
-    reason = (str(error).splitlines() or [""])[0][:200]
-    raise OutOfMemory(
-        f"Memory is not enough to sample {roles.settings.batch_size} responses at once ({reason}). Choose a "
-        "smaller --batch-size, --max-new-tokens or --max-prompt-tokens; --micro-batch-size makes the pass "
-        "over the finished responses smaller."
-    ) from error
-
-
-def _evaluated(roles: Roles, answers: Completions, *, keep: bool = False) -> Experience:
+def _evaluated(
+    roles: Roles, answers: Completions, *, keep: bool = False, short_of_memory: bool = False
+) -> Experience:
     settings, rows = roles.settings, len(answers.tokens)
     size = rows if keep else settings.update.micro_batch_size or rows
-    # a folded weight rounds otherwise than weight and adapter apart, which is what trains: in float32 within
-    # the tolerance, in bfloat16 far beyond it
+    # a folded weight rounds differently from weight and adapter apart, which is what trains: in float32 this
+    # is within the tolerance, in bfloat16 far beyond it
     folded = settings.dtype == "float32" and not keep
     with roles.frozen_policy() if folded else contextlib.nullcontext(), torch.set_grad_enabled(keep):
         pieces = [_evaluate(roles, answers, slice(k, k + size)) for k in range(0, rows, size)]
@@ -125,9 +125,7 @@ def _evaluated(roles: Roles, answers: Completions, *, keep: bool = False) -> Exp
         name: None if first is None else torch.cat([piece[name] for piece in pieces]).detach()
         for name, first in pieces[0].items()
     }
-    return Experience(
-        answers.tokens, answers.real, answers.responses, answers.seconds, first_pass=first_pass, **joined
-    )
+    return Experience(**{**vars(answers), **joined}, first_pass=first_pass, short_of_memory=short_of_memory)
 
 
 def _evaluate(roles: Roles, answers: Completions, rows: slice) -> dict[str, Any]:
@@ -135,16 +133,16 @@ def _evaluate(roles: Roles, answers: Completions, rows: slice) -> dict[str, Any]
     tokens, real, responses = answers.tokens[rows], answers.real[rows], answers.responses
     mask = responses.mask[rows]
     first = tokens.shape[1] - mask.shape[1] - 1
-    lower = roles.trunk.lower(tokens, real)
-    policy = roles.policy.hidden(tokens, real, lower)
-    with torch.no_grad():
-        reference = roles.reference.hidden(tokens, real, lower)[:, first:-1]
-    support = None if responses.support is None else responses.support[rows][mask]
-    found = token_statistics(
-        policy[:, first:-1][mask], roles.trunk.parts.head, responses.tokens[rows][mask], roles.sampling,
-        support=support, reference=reference[mask], reference_head=roles.reference.trunk.parts.head,
-        ahead=roles.settings.logp_alone,
-    )  # fmt: skip
+    lower = roles.policy.trunk.lower(tokens, real)
+    # the reference trains nothing, so that its pass keeps no graph
+    policy, reference = (role.hidden(tokens, real, lower) for role in (roles.policy, roles.reference))
+    reference = reference[:, first:-1]
+    found = roles.statistics(
+        policy[:, first:-1][mask],
+        tokens=responses.tokens[rows][mask],
+        support=None if responses.support is None else responses.support[rows][mask],
+        reference=reference[mask],
+    )
     zeros = torch.zeros(mask.shape, device=tokens.device)
     values, final = zeros, zeros[:, 0]
     if roles.critic_head is not None:
@@ -152,7 +150,6 @@ def _evaluate(roles: Roles, answers: Completions, rows: slice) -> dict[str, Any]
         every = roles.critic_head(hidden[:, first:].float())[:, :, 0]
         values = torch.where(mask, every[:, :-1], 0.0)
         final = every.gather(1, mask.sum(1, keepdim=True))[:, 0]
-    kept = torch.where(mask[..., None], reference, 0.0) if roles.settings.exact_in_loss else None
     return {
         "logp": zeros.masked_scatter(mask, found.logp),
         "entropy": zeros.masked_scatter(mask, found.entropy),
@@ -161,34 +158,29 @@ def _evaluate(roles: Roles, answers: Completions, rows: slice) -> dict[str, Any]
         "values": values,
         "final_values": final,
         "lower": lower,
-        "ref_hidden": kept,
+        "ref_hidden": torch.where(mask[..., None], reference, 0.0) if roles.settings.exact_in_loss else None,
     }
 
 
-def kl_share(experience: Experience, settings: AlignSettings, kl_beta: float) -> Tensor:
-    """What the KL to the reference adds to the reward of each token, [B, R]; 0 where it is all in the loss.
-
-    Its log-probabilities are those of the pass that trains, for policy and reference alike: before the first
-    step they are equal to the bit, where those of sampling differ by rounding, which normalised advantages
-    would blow up to full strength.
+@dataclass
+class TokenRewards:
+    """``rewards`` [B, R] of a rollout, and what the KL adds to them (``kl_share``). They were multiplied by
+    ``scale``, the share was not: 1, or with ``whiten_rewards`` one over their deviation.
     """
-    return kl_rewards(
-        settings.kl,
-        kl_beta,
-        logp=experience.logp,
-        ref_logp=experience.ref_logp,
-        exact=experience.exact,
-        mask=experience.responses.mask,
-        gamma=settings.update.gamma,
-    )
+
+    rewards: Tensor
+    kl_share: Tensor
+    scale: float = 1.0
 
 
 def rewards_of(
     experience: Experience, scores: Scores, settings: AlignSettings, kl_beta: float
-) -> tuple[Tensor, float]:
-    """Rewards per token [B, R]: what the KL costs, and the score on the last real token.
+) -> TokenRewards:
+    """What the KL to the reference costs at each token, and the score on the last real one.
 
-    With them what they were multiplied by: 1, or with ``whiten_rewards`` one over their deviation.
+    The KL is that of the pass that trains, for policy and reference alike: before the first step their
+    log-probabilities are identical. Those of sampling differ by rounding, which normalised advantages would
+    amplify to full strength.
     """
     mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
     total = torch.from_numpy(np.nan_to_num(scores.total)).to(experience.logp) * settings.reward_scale
@@ -196,22 +188,30 @@ def rewards_of(
         total = total.clamp(-settings.reward_clip, settings.reward_clip)
     if settings.missing_eos_penalty is not None:
         total = torch.where(experience.responses.ended, total, total - settings.missing_eos_penalty)
-    found = kl_share(experience, settings, kl_beta)
-    found[rows, experience.last] += total
-    if not settings.whiten_rewards:
-        return found, 1.0
+    share = kl_rewards(
+        settings.kl,
+        kl_beta,
+        logp=experience.logp,
+        ref_logp=experience.ref_logp,
+        exact=experience.exact,
+        mask=mask,
+        gamma=settings.update.gamma,
+    )
+    rewards = share.clone()
+    rewards[rows, mask.sum(1) - 1] += total
     counting = mask & torch.from_numpy(scores.valid).to(mask.device)[:, None]
-    scale = 1.0 / (float(masked_variance(found, counting).sqrt()) + 1e-8) if bool(counting.any()) else 1.0
-    return torch.where(mask, found * scale, 0.0), scale
+    if not settings.whiten_rewards or not bool(counting.any()):
+        return TokenRewards(rewards, share)
+    scale = 1.0 / (float(masked_variance(rewards, counting).sqrt()) + 1e-8)
+    return TokenRewards(torch.where(mask, rewards * scale, 0.0), share, scale)
 
 
-def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: AlignSettings) -> Batch:
+def batch_of(experience: Experience, rewards: Tensor, valid: Tensor, settings: AlignSettings) -> Batch:
     """Advantages and returns of the responses whose score counts (``valid`` [B]), as ppo.update takes
     them.
     """
-    mask, last = experience.responses.mask, experience.last
-    rows = torch.arange(len(mask))
-    ended = torch.zeros_like(mask)
+    mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
+    last, ended = mask.sum(1) - 1, torch.zeros_like(mask)
     ended[rows, last] = True
     terminated = ended.clone()
     if settings.truncation == "bootstrap":
@@ -223,7 +223,7 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
     else:
         following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], 1)
         following = torch.where(ended, experience.final_values[:, None], following)
-        policy_lambda: Any = update.gae_lambda
+        policy_lambda: float | Tensor = update.gae_lambda
         if settings.lambda_alpha is not None:
             policy_lambda = length_lambda(mask.sum(1), settings.lambda_alpha)
         critic_lambda = update.gae_lambda if settings.critic_lambda is None else settings.critic_lambda
@@ -241,7 +241,7 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
         one_lambda = settings.lambda_alpha is None and critic_lambda == policy_lambda
         targets = (advantages if one_lambda else estimate(gae_lambda=critic_lambda)) + values
     old = experience.responses.logp if settings.dtype == "float32" else experience.logp
-    inputs = Inputs(
+    inputs = ResponseInputs(
         tokens=experience.tokens,
         real=experience.real,
         ref_logp=experience.ref_logp,
@@ -250,7 +250,8 @@ def to_batch(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
         ref_hidden=experience.ref_hidden,
         support=experience.responses.support,
     )
-    batch = Batch(inputs.as_dict(), experience.responses.tokens, old, values, advantages, targets, mask)
+    known = {name: x for name, x in vars(inputs).items() if x is not None}
+    batch = Batch(known, experience.responses.tokens, old, values, advantages, targets, mask)
     return batch.select(valid.nonzero()[:, 0])
 
 
@@ -259,7 +260,7 @@ def length_lambda(lengths: Tensor, alpha: float) -> Tensor:
     return (1.0 - 1.0 / (alpha * lengths.float())).clamp(min=0.0)
 
 
-def comparable(valid: np.ndarray, samples: int) -> np.ndarray:
+def has_baseline(valid: np.ndarray, samples: int) -> np.ndarray:
     """Of responses whose score counts [B], those that another response to the same prompt, whose score counts
     too, can be compared with.
     """

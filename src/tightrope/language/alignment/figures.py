@@ -5,26 +5,25 @@ finite, and probabilities that are not those of sampling.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tightrope.algorithms.descent import SamplingMismatch
 from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
-from tightrope.algorithms.optimise import SamplingMismatch
-from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.policy.roles import Roles
 from tightrope.language.policy.rollout import Experience
 from tightrope.language.reward.functions import Scores
 from tightrope.maths import divergence
 from tightrope.maths.statistics import masked_mean, masked_sum
 
 
-def describe(
+def rollout_metrics(
     experience: Experience, scores: Scores, rewards: Tensor, kl_share: Tensor, valid: Tensor
 ) -> dict[str, float]:
-    """The metrics of a rollout: sums over a response, and token means under names that say so. ``rewards``
-    and the share of the KL in them, before any scaling, are [B, R].
+    """The metrics of a rollout: sums over a response, and means over tokens where the name says so.
+    ``rewards`` and the share of the KL in them, before any scaling, are [B, R].
 
     Scores and rewards are those of the responses that count, everything else is of all of them; NaN for a
     score where none counts.
@@ -49,15 +48,14 @@ def describe(
         "objective/entropy": -experience.logp,
         "objective/entropy_exact": experience.entropy,
     }
-    per_scored_response = {"objective/rlhf_reward": rewards, "objective/non_score_reward": kl_share}
     counting = mask & valid[:, None]
+    sums = {name: (x, mask, len(mask)) for name, x in per_response.items()} | {
+        "objective/rlhf_reward": (rewards, counting, len(total)),
+        "objective/non_score_reward": (kl_share, counting, len(total)),
+    }
     gap = (experience.responses.logp - experience.logp)[mask].abs()
     return {
-        **{name: float(masked_sum(x, mask)) / len(mask) for name, x in per_response.items()},
-        **{
-            name: float(masked_sum(x, counting)) / len(total) if len(total) else nan
-            for name, x in per_scored_response.items()
-        },
+        **{name: float(masked_sum(x, of)) / count if count else nan for name, (x, of, count) in sums.items()},
         **{name: float(masked_mean(x, mask)) for name, x in per_token.items()},
         "objective/scores": float(np.mean(total)) if len(total) else nan,
         "objective/scores_std": float(np.std(total)) if len(total) else nan,
@@ -65,22 +63,22 @@ def describe(
         "objective/eos_fraction": float(ended.float().mean()),
         "objective/truncated_fraction": float((~ended).float().mean()),
         "objective/masked_samples": float((~valid).sum()),
-        "objective/distinct_2": distinct(experience.ids()),
+        "objective/distinct_2": distinct_ngrams(experience.ids),
         "objective/sampling_gap": float(gap.max()) if gap.numel() else 0.0,
         "time/generate_seconds": experience.seconds,
         "time/tokens_per_second": float(mask.sum()) / max(experience.seconds, 1e-9),
     }
 
 
-def distinct(rows: list[list[int]], n: int = 2) -> float:
+def distinct_ngrams(rows: list[list[int]], n: int = 2) -> float:
     """Distinct n-grams / all n-grams over a batch: falls towards 0 when responses repeat themselves."""
     grams = [tuple(row[k : k + n]) for row in rows for k in range(len(row) - n + 1)]
     return len(set(grams)) / len(grams) if grams else 1.0
 
 
-def refuse_bad_numbers(experience: Experience, weights: Iterable[tuple[str, Tensor]]) -> None:
-    """NonFiniteError when a role computed a number that is not finite; the first bad one of the named
-    ``weights`` is part of the message.
+def refuse_bad_numbers(experience: Experience, roles: Roles) -> None:
+    """NonFiniteError when a role computed a number that is not finite; the message names the first bad
+    weight, where there is one.
     """
     figures = (
         ("log-probability of sampling", experience.responses.logp),
@@ -94,18 +92,17 @@ def refuse_bad_numbers(experience: Experience, weights: Iterable[tuple[str, Tens
     found = first_bad([(f"The {name} of response, token ", torch.where(mask, x, 0.0)) for name, x in figures])
     if found is None:
         return
-    weight = first_bad((f"the weight {name}", p) for name, p in weights)
+    weight = first_bad((f"the weight {name}", p) for name, p in roles.named_parameters())
     raise NonFiniteError(
         f"{found}; expected a finite number, but {weight or 'every weight is one: sums overflow'}. Nothing "
         "was learned from this batch. Look for a learning rate that is too high."
     )
 
 
-def refuse_mismatch(gap: float, dtype: str, *, first: bool) -> None:
-    """SamplingMismatch when log-probabilities of sampling and of the pass that trains are further apart, in
-    nats, than rounding can be. ``first``: nothing was learned yet.
+def refuse_mismatch(gap: float, limit: float, dtype: str, *, first: bool) -> None:
+    """SamplingMismatch when log-probabilities of sampling and of the pass that trains differ by more than
+    rounding can explain (``limit``, in nats). ``first``: nothing was learned yet.
     """
-    limit = log_ratio_limit(dtype)
     # the tail of rounding errors grows with the tokens of a run: in bfloat16 only the beginning is checked
     checked = dtype == "float32" or first or not math.isfinite(gap)
     if checked and not gap <= limit:

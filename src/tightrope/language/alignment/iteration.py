@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,15 +18,14 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
 from tightrope.language.alignment.experience import (
     PromptOrder,
-    comparable,
+    batch_of,
     gather,
-    kl_share,
+    has_baseline,
     respond,
     rewards_of,
-    to_batch,
 )
-from tightrope.language.alignment.figures import describe, refuse_bad_numbers, refuse_mismatch
-from tightrope.language.alignment.kl import AdaptiveKL, kl_loss, shared_scale
+from tightrope.language.alignment.figures import refuse_bad_numbers, refuse_mismatch, rollout_metrics
+from tightrope.language.alignment.kl import adapted, kl_loss, shared_scale
 from tightrope.language.alignment.monitor import Monitor
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.alignment.samples import sample_rows
@@ -39,15 +38,16 @@ from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.policy.rollout import Experience, FirstPass
 from tightrope.language.reward.call import RewardError
+from tightrope.language.reward.functions import Scores
 from tightrope.language.reward.judge import (
     Judge,
     critic_from_reward,
-    is_folder,
+    folder_of,
     make_judge,
     reward_adapter,
     shares_trunk,
 )
-from tightrope.language.settings import AlignSettings
+from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.maths.values import explained_variance
 from tightrope.runs.checkpoint import understood
 from tightrope.runs.history import Checkpoint
@@ -56,6 +56,11 @@ from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors, restore_tensors, tensors_of
+
+# what a checkpoint holds of a trainer as it is, and how it is read back
+SAVED: dict[str, Callable[[Any], Any]] = {
+    "episodes": int, "iteration": int, "kl_beta": float, "stopped": bool, "seconds": float, "newest": figures,
+}  # fmt: skip
 
 
 class Trainer:
@@ -73,7 +78,7 @@ class Trainer:
             settings,
             on_trunk,
             listeners.info,
-            own_reward=on_trunk is None and is_folder(reward),
+            own_reward=on_trunk is None and folder_of(reward) is not None,
         )
         self.prompts = self._read_prompts(prompts)
         self.judge = make_judge(reward, self.roles, on_trunk=on_trunk, timeout=settings.reward_timeout)
@@ -94,11 +99,12 @@ class Trainer:
             Pretraining.make(settings, self.roles, listeners.warn) if settings.ptx_weight else None
         )
         self.monitor = Monitor(kl_budget=settings.kl_budget)
-        self.episodes, self.iteration, self.stopped, self.reward_scale = 0, 0, False, 1.0
+        self.log_ratio_limit = log_ratio_limit(settings.dtype)
+        self.episodes, self.iteration, self.stopped = 0, 0, False
         self.seconds, self.rollbacks, self.newest = 0.0, 0, dict[str, float]()
         self.changes: dict[str, Any] = {}
         self.micro_batch_size = settings.update.micro_batch_size  # halved when memory runs out
-        self._told = set[tuple[str, str]]()
+        self._warned = set[tuple[str, str]]()
 
     def _read_prompts(self, source: Any) -> list[Prompt]:
         settings, limit = self.settings, context_length(self.roles.model)
@@ -140,7 +146,7 @@ class Trainer:
         return self.roles.lines()
 
     def evaluate(self, update: Update | None) -> dict[str, float]:
-        """Nothing: the gold judge is asked before an iteration, so that score and KL are of one policy."""
+        """Nothing: gold scores are taken before an iteration, so that score and KL belong to one policy."""
         if update is not None:
             self.newest = update.metrics
         return {}
@@ -156,7 +162,7 @@ class Trainer:
         rows = run.read_metrics()
         if rows and not any("train/minibatches" in row for row in rows):
             self.listeners.warn(
-                "not one step was taken: no response had a score that counts. The model is as it was."
+                "not one step was taken: no response had a score that counts. The model is unchanged."
             )
         shown = ("objective/", "eval/")
         return {
@@ -178,8 +184,8 @@ class Trainer:
         return max(0, min(self.settings.batch_size, left)) // self.settings.samples_per_prompt
 
     def _reached(self, fraction: float | None) -> bool:
-        """Whether the newest iteration, which like all but the last one was of the full size, came to a point
-        of this grid.
+        """Whether the newest iteration reached a point of this grid. All iterations but the last are of the
+        full size.
         """
         samples = self.settings.samples_per_prompt
         before = self.episodes - self.settings.batch_size // samples * samples
@@ -191,26 +197,21 @@ class Trainer:
         for alarm in self.monitor.add(*seen):
             self.listeners.warn(alarm.text)
             self.stopped = self.stopped or alarm.stop
-        metrics |= self.monitor.metrics()
+        if self.monitor.fit.decided:
+            metrics["objective/gold_predicted_peak_kl"] = self.monitor.fit.peak_kl
 
     # ------------------------------------------------------------------------------------------ the state
 
     def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
         """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
-        state: dict[str, Any] = {
+        state: dict[str, Any] = {name: getattr(self, name) for name in SAVED} | {
             "story": "align",
-            "episodes": self.episodes,
-            "iteration": self.iteration,
-            "kl_beta": self.kl_beta,
             "rollbacks": self.rollbacks,
             "micro_batch_size": self.micro_batch_size,
             "prompt_position": self.order.position,
             "prompts_sha256": self._hash_of_prompts(),
             "rng": {"update": self.update_rng.bit_generator.state},
             "monitor": self.monitor.state(),
-            "stopped": self.stopped,
-            "newest": self.newest,
-            "seconds": self.seconds,
         }
         if self.pretraining is not None:
             state["rng"]["ptx"] = self.pretraining.rng.bit_generator.state
@@ -222,25 +223,21 @@ class Trainer:
         """
         folder, tensors, state = point
         if state.get("story") != "align":
-            raise ValueError(f"{folder} is no checkpoint of an alignment run.")
+            raise ValueError(f"{folder} is not a checkpoint of an alignment run.")
         if state.get("prompts_sha256") != self._hash_of_prompts():
             raise ValueError(
                 f"{folder} is of a run with other prompts than these {len(self.prompts):,}. Give those that "
-                "the run began with, or begin a new run."
+                "the run started with, or start a new run."
             )
         with understood(folder):
             restore_tensors(tensors, self.roles.parameters(), self.optimiser)
-            self.episodes = int(state["episodes"])
-            self.iteration = int(state["iteration"])
-            self.kl_beta = float(state["kl_beta"])
+            for name, read in SAVED.items():
+                setattr(self, name, read(state[name]))
             self.rollbacks = int(state.get("rollbacks", 0))
             self.micro_batch_size = state.get("micro_batch_size", self.micro_batch_size)
             self.order.position = int(state["prompt_position"])
             self.update_rng.bit_generator.state = state["rng"]["update"]
             self.monitor.restore(state["monitor"])
-            self.stopped = bool(state["stopped"])
-            self.seconds = float(state["seconds"])
-            self.newest = figures(state["newest"])
             if self.pretraining is not None:
                 self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 
@@ -286,25 +283,27 @@ class Trainer:
         experience = gather(self.roles, prompts, *given, keep=keep)
         if experience.short_of_memory:
             self._smaller(len(experience.tokens))
-        refuse_bad_numbers(experience, self.roles.named_parameters())
+        refuse_bad_numbers(experience, self.roles)
         gathered = time.perf_counter()
         asked = [prompt for prompt in prompts for _ in range(settings.samples_per_prompt)]
         scores = self.judge(asked, experience, self._trainer_state())
         scored = time.perf_counter()
-        self._tell_faults(scores)
+        self._warn_of_faults(scores)
         if settings.critic == "none":
-            scores.valid[:] = comparable(scores.valid, settings.samples_per_prompt)
-        rewards, self.reward_scale = rewards_of(experience, scores, settings, self.kl_beta)
+            scores.valid[:] = has_baseline(scores.valid, settings.samples_per_prompt)
+        found = rewards_of(experience, scores, settings, self.kl_beta)
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
-        batch = to_batch(experience, rewards, valid, settings)
-        share = kl_share(experience, settings, self.kl_beta)
-        plain = rewards / self.reward_scale  # the metrics are those before whiten_rewards
-        metrics = describe(experience, scores, plain, share, valid) | scores.metrics | gold
-        refuse_mismatch(metrics["objective/sampling_gap"], settings.dtype, first=not self.iteration)
+        batch = batch_of(experience, found.rewards, valid, settings)
+        plain = found.rewards / found.scale  # the metrics are those before whiten_rewards
+        metrics = rollout_metrics(experience, scores, plain, found.kl_share, valid) | scores.metrics | gold
+        gap = metrics["objective/sampling_gap"]
+        refuse_mismatch(gap, self.log_ratio_limit, settings.dtype, first=not self.iteration)
         self._watch(metrics)
-        judged = time.perf_counter()
-        if len(batch) and not self.stopped:
-            metrics |= self._update(batch, present, experience)
+        prepared = time.perf_counter()
+        counts = bool(scores.valid.any())
+        if counts and not self.stopped:
+            # a KL in the loss is scaled as the rewards were
+            metrics |= self._update(batch, present, experience, self.kl_beta * found.scale)
             if settings.critic != "none":
                 metrics["train/explained_variance"] = float(
                     explained_variance(batch.old_values, batch.returns, batch.mask)
@@ -312,10 +311,10 @@ class Trainer:
         metrics["objective/kl_beta"] = self.kl_beta
         metrics["train/learning_rate"] = present.learning_rate
         metrics["time/score_seconds"] = scored - gathered
-        metrics["time/update_seconds"] = time.perf_counter() - judged
-        if settings.kl_goal is not None and len(batch):
-            controller = AdaptiveKL(self.kl_beta, settings.kl_goal, settings.kl_horizon)
-            self.kl_beta = controller.next(metrics["objective/kl"], len(asked)).kl_beta
+        metrics["time/update_seconds"] = time.perf_counter() - prepared
+        if settings.kl_goal is not None and counts:
+            goal = {"target": settings.kl_goal, "horizon": settings.kl_horizon}
+            self.kl_beta = adapted(self.kl_beta, metrics["objective/kl"], len(asked), **goal)
         self.episodes += len(asked)
         self.iteration += 1
         seconds = metrics["time/update_seconds"] + scored - begin
@@ -324,28 +323,32 @@ class Trainer:
         on_grid = self._reached(settings.checkpoint_every)
         return Update(self.episodes, self.total, metrics, before, on_grid=on_grid, samples=rows, pause=pause)
 
-    def _update(self, batch: Batch, present: Any, experience: Experience) -> dict[str, float]:
-        """PPO, or the critic alone while it warms up."""
+    def _update(
+        self, batch: Batch, present: RLHFSettings, experience: Experience, kl_weight: float
+    ) -> dict[str, float]:
+        """PPO, or only the critic while it warms up. ``kl_weight``: of a KL in the loss."""
         warming = self.iteration < self.settings.critic_warmup
-        exact = self.settings.exact_in_loss
-        model = PolicyModel(
-            self.roles, exact=exact, critic_only=warming, first_pass=experience.take_first_pass()
-        )
+        model = PolicyModel(self.roles, critic_only=warming, first_pass=experience.first_pass)
+        experience.first_pass = None  # where memory runs out, nothing else may hold on to its graph
         if warming:
             batch = dataclasses.replace(batch, advantages=torch.zeros_like(batch.advantages))
             present = present.unchecked(entropy_weight=0.0, target_kl=None)
-        limit = log_ratio_limit(self.settings.dtype)
-        kl_weight = self.kl_beta * self.reward_scale  # a KL in the loss is scaled as the rewards were
         if present.normalise_advantages and not self.settings.kl.endswith("reward"):
             # one scale for the whole rollout, so that a KL in the loss keeps its price in units of the reward
             advantages, scale = shared_scale(batch.advantages, batch.mask)
             batch = dataclasses.replace(batch, advantages=advantages)
             kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
         extra = None if warming else self._extra_loss(kl_weight)
-        present = present.unchecked(micro_batch_size=self.micro_batch_size)
-        given = (model, self.optimiser, batch, present, self.update_rng)
-        draw = None if extra is None or self.pretraining is None else self.pretraining.draw
-        metrics = ppo.update(*given, extra_loss=extra, draw=draw, log_ratio_limit=limit)
+        metrics = ppo.update(
+            model,
+            self.optimiser,
+            batch,
+            present.unchecked(micro_batch_size=self.micro_batch_size),
+            self.update_rng,
+            extra_loss=extra,
+            draw=None if extra is None or self.pretraining is None else self.pretraining.draw,
+            log_ratio_limit=self.log_ratio_limit,
+        )
         if "train/micro_batch_size" in metrics:
             self._smaller(int(metrics["train/micro_batch_size"]))
         return metrics
@@ -355,7 +358,7 @@ class Trainer:
         self.micro_batch_size = size
         self.listeners.warn(
             f"memory ran out; from now on {size} responses a pass, and none is kept for the update. The "
-            f"gradient is the same. Say --micro-batch-size {size} to begin with it."
+            f"gradient is the same. Use --micro-batch-size {size} to start with that size."
         )
 
     def _extra_loss(self, kl_weight: float) -> Any:
@@ -363,30 +366,30 @@ class Trainer:
         form, pretraining = self.settings.kl, self.pretraining
 
         def extra(model: Any, part: Batch, now: FirstPass, count: Tensor) -> tuple[Tensor, dict[str, Any]]:
-            total, booked = now.logp.new_zeros(()), dict[str, Any]()
+            total, figures = now.logp.new_zeros(()), dict[str, Any]()
             log_ratio = now.logp.detach() - part.old_logp
             kl = kl_loss(form, now.logp, part.inputs["ref_logp"], now.kl, part.mask, count, log_ratio)
             if kl is not None:
                 total = total + kl_weight * kl
-                booked["kl_loss"] = kl.detach() * count / part.mask.sum().clamp(min=1) * part.mask
+                figures["kl_loss"] = kl.detach() * count / part.mask.sum().clamp(min=1) * part.mask
             if pretraining is not None:
                 # a sum over the texts of one response beside a sum over the response, as in InstructGPT
                 loss, tokens = pretraining.loss(part.inputs["ptx"])
                 total = total + self.settings.ptx_weight * loss / (pretraining.per_response * count)
-                booked["ptx_loss"] = loss, tokens
-            return total, booked
+                figures["ptx_loss"] = loss, tokens
+            return total, figures
 
         return extra if not form.endswith("reward") or pretraining is not None else None
 
-    def _tell_faults(self, scores: Any, judge: str = "") -> None:
-        """Say once a run for each function and kind why samples are left out; the count is a metric."""
+    def _warn_of_faults(self, scores: Scores, judge: str = "") -> None:
+        """Warn once per run, function and kind why samples are left out; their number is a metric."""
         for fault in scores.faults:
-            if (judge + fault.function, fault.kind) not in self._told:
-                self._told.add((judge + fault.function, fault.kind))
+            if (judge + fault.function, fault.kind) not in self._warned:
+                self._warned.add((judge + fault.function, fault.kind))
                 self.listeners.warn(judge + fault.text)
 
     def _trainer_state(self) -> SimpleNamespace:
-        """What TRL's reward functions may look at: iterations so far and in all, passes over the prompts."""
+        """What TRL's reward functions may read: iterations so far and in total, passes over the prompts."""
         return SimpleNamespace(
             global_step=self.iteration,
             max_steps=-(-self.settings.total_episodes // self.settings.batch_size),
@@ -395,8 +398,8 @@ class Trainer:
         )
 
     def gold_scores(self) -> dict[str, float]:
-        """The mean gold score of responses to held-out prompts, sampled as in training, as many at a time;
-        and how many of them the judge gave no score.
+        """The mean gold score of responses to held-out prompts, which are sampled as in training, a batch at
+        a time; and how many of them got no score.
         """
         assert self.gold is not None
         size, seed, found = self.settings.batch_size, self.settings.seed + 1_000_003, list[np.ndarray]()
@@ -407,7 +410,7 @@ class Trainer:
                 scores = self.gold(prompts, answers, self._trainer_state())
             except RewardError as error:
                 raise RewardError(f"The gold judge: {error}") from error
-            self._tell_faults(scores, "the gold judge: ")
+            self._warn_of_faults(scores, "the gold judge: ")
             found.append(scores.total[scores.valid])
         judged = np.concatenate(found)
         mean = float(judged.mean()) if len(judged) else float("nan")

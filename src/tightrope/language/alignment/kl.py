@@ -20,10 +20,14 @@ the loss by its own derivative. That decides what each form is, in expectation:
     exact-loss     -                         kl_beta D(s_t)          right, without noise    not seen
 
 The pure loss forms are blind: pi does not learn to avoid tokens that lead to states in which it will differ
-much from the reference. Everything else is biased; `BIASED_KL_FORMS` says how. Of the two right ones
-k1-reward is the quieter near the optimum: there sum_t (r_t - kl_beta k1_t) is the same for every response,
-and with a good critic the noise of the scores and that of the KL cancel. Where the policy has wandered off
-without being paid for it, exact-split is.
+much from the reference. Of the two right ones k1-reward has less noise near the optimum: there
+sum_t (r_t - kl_beta k1_t) is the same for every response, and with a good critic the noise of the scores and
+that of the KL cancel. Where the policy has moved away without a gain in score, exact-split has less.
+
+Other forms have a wrong gradient and are not offered. In this state: k2 in the reward has E[k2 grad log pi],
+of second order near the reference, so that small departures cost almost nothing; k3 in the reward has that of
+KL(pi || ref) - KL(ref || pi), which nearly cancel there; the exact KL in the reward has none; k1 in the loss
+has an expected gradient of 0; k3 in the loss has that of KL(ref || pi).
 
 Three things keep kl_beta the price of one nat in units of the reward:
 
@@ -37,7 +41,7 @@ Three things keep kl_beta the price of one nat in units of the reward:
   no longer belong together. Exact equality needs ``normalise_advantages`` off; to have both, take
   `shared_scale` before the update. The same goes for rewards that are whitened.
 - **Epochs.** The actions are those of the old policy. The exact KL in the loss is that of the policy as it is
-  now, in every epoch; for k2, weights pi / pi_old (``log_ratio``) make up for it. A KL in the reward is that
+  now, in every epoch; for k2, weights pi / pi_old (``log_ratio``) correct for it. A KL in the reward is that
   of the sampling policy, and the clip acts on it as on the rest of the advantage.
 
 Sources: Schulman, http://joschu.net/blog/kl-approx.html; Ziegler et al. 2019, arXiv 1909.08593.
@@ -45,9 +49,7 @@ Sources: Schulman, http://joschu.net/blog/kl-approx.html; Ziegler et al. 2019, a
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -56,44 +58,7 @@ from tightrope.maths import divergence, statistics, surrogate
 from tightrope.maths.shapes import require_same_shape
 
 KL_FORMS = ("k1-reward", "exact-split", "k2-loss", "exact-loss")
-BIASED_KL_FORMS = {
-    "k2-reward": (
-        "k2 in the reward: in the state at hand its gradient is E[k2 grad log pi], of second order near the "
-        "reference, so that small departures cost almost nothing; and k2 is not the KL of later states"
-    ),
-    "k3-reward": (
-        "k3 in the reward: in the state at hand its gradient is that of KL(pi || ref) - KL(ref || pi), which "
-        "nearly cancel near the reference; only the KL of later states is right"
-    ),
-    "exact-reward": (
-        "the exact KL in the reward: it does not depend on the token chosen in the state at hand, so its "
-        "gradient there is 0; only the KL of later states is right"
-    ),
-    "k1-loss": "k1 in the loss: its expected gradient is 0, it adds noise and no pull to the reference",
-    "k3-loss": (
-        "k3 in the loss: its gradient is that of the forward KL(ref || pi), not of KL(pi || ref), and it is "
-        "blind to later states"
-    ),
-}
 LARGEST_CHANGE = 0.2  # Ziegler 2019: the relative error of the KL is clipped to +- this
-
-
-def bias_of(form: str) -> str | None:
-    """What is wrong with the gradient of a form, in words for a warning; None for the four sound ones.
-
-    ValueError when there is no such form.
-    """
-    if form not in KL_FORMS and form not in BIASED_KL_FORMS:
-        raise ValueError(
-            f"kl is {form!r}; expected {', '.join(KL_FORMS)}, or, biased, {', '.join(BIASED_KL_FORMS)}."
-        )
-    return BIASED_KL_FORMS.get(form)
-
-
-def needs_exact(form: str) -> bool:
-    """Whether a form reads the exact KL of the states. ValueError when there is no such form."""
-    bias_of(form)
-    return form.startswith("exact")
 
 
 def kl_rewards(
@@ -111,45 +76,20 @@ def kl_rewards(
     reference's. ``exact`` [B, R]: D(s_t), None where the form does not need it. Pure loss forms give 0.
     With exact-split step t pays for the state it leads to, gamma * D(s_{t+1}), and the last step of a
     response for nothing (where the critic continues a cut response, the KL of that one state is left out).
-    ``gamma`` is that of the returns. The counting steps of a row must stand together, from column 0 on.
+    ``gamma`` is that of the returns. The counting steps of a row must be contiguous and start at column 0.
     ValueError when shapes differ, ``exact`` is missing, or the KL of a counting step is not finite.
     """
-    name, _, place = form.partition("-")
     exact = _checked(form, logp, ref_logp, exact, mask)
+    if form.endswith("loss") or kl_beta == 0:
+        return torch.zeros_like(logp)
     with torch.no_grad():
-        if place == "loss" or kl_beta == 0:
-            return torch.zeros_like(logp)
-        kl = _estimate(name, logp, ref_logp, exact, mask)
-        if place == "split":
-            kl = gamma * torch.cat([kl[:, 1:], torch.zeros_like(kl[:, :1])], dim=1)
+        if form == "k1-reward":
+            kl = divergence.k1(_log_ratio(logp, ref_logp, mask))
+        else:
+            following = torch.where(mask, exact, 0.0)[:, 1:]
+            kl = gamma * torch.nn.functional.pad(following, (0, 1))
         _require_finite(kl)
         return torch.where(mask, -kl_beta * kl, 0.0)
-
-
-def kl_steps(
-    form: str,
-    logp: Tensor,
-    ref_logp: Tensor,
-    exact: Tensor | None,
-    mask: Tensor,
-    log_ratio: Tensor | None = None,
-) -> Tensor | None:
-    """The KL per step of which a form puts the gradient into the loss, [B, R]; None: a reward form.
-
-    0 where masked. ``logp`` and ``exact`` are of the policy as it is now, with their graphs. ``log_ratio``
-    [B, R] = log pi / pi_old, no gradient flows through it: k-forms are weighted with pi / pi_old, which keeps
-    their expected gradient right when the policy has moved since it sampled. None: no weights, as is right in
-    the first step only. The exact forms need none. ValueError when shapes differ or ``exact`` is missing.
-    """
-    name, _, place = form.partition("-")
-    exact = _checked(form, logp, ref_logp, exact, mask)
-    if place == "reward":
-        return None
-    kl = _estimate(name, logp, ref_logp.detach(), exact, mask)
-    if log_ratio is None or name == "exact":
-        return kl
-    require_same_shape(log_ratio=log_ratio, mask=mask)
-    return kl * torch.where(mask, log_ratio.detach(), 0.0).exp()
 
 
 def kl_loss(
@@ -161,13 +101,24 @@ def kl_loss(
     count: float | Tensor,
     log_ratio: Tensor | None = None,
 ) -> Tensor | None:
-    """The mean of `kl_steps` over a minibatch, a scalar to be multiplied by kl_beta; None: a reward form.
+    """The mean KL of a minibatch, a scalar to be multiplied by kl_beta; None for k1-reward: it has no loss.
 
-    sum over the counting steps at hand / ``count``, the number of counting steps of the WHOLE minibatch: the
-    scale of ppo.update's own policy loss, so that kl_beta weighs it against rewards, and parts add up.
+    sum over the counting steps given here / ``count``, the number of counting steps of the WHOLE minibatch.
+    This is the scale of ppo.update's own policy loss: kl_beta weighs it against rewards, and parts add up.
+    ``logp`` and ``exact`` are of the policy as it is now, with their graphs. ``log_ratio`` [B, R] =
+    log pi / pi_old, no gradient flows through it: k2 is weighted with pi / pi_old, which keeps its expected
+    gradient right when the policy has moved since it sampled. None: no weights, which is right only in the
+    first step. The exact forms need none. ValueError when shapes differ or ``exact`` is missing.
     """
-    steps = kl_steps(form, logp, ref_logp, exact, mask, log_ratio)
-    return None if steps is None else statistics.masked_mean(steps, mask, count)
+    steps = _checked(form, logp, ref_logp, exact, mask)
+    if form == "k1-reward":
+        return None
+    if form == "k2-loss":
+        steps = divergence.k2(_log_ratio(logp, ref_logp.detach(), mask))
+        if log_ratio is not None:
+            require_same_shape(log_ratio=log_ratio, mask=mask)
+            steps = steps * torch.where(mask, log_ratio.detach(), 0.0).exp()
+    return statistics.masked_mean(steps, mask, count)
 
 
 def shared_scale(advantages: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -182,59 +133,35 @@ def shared_scale(advantages: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     return statistics.standardise(advantages, mask), scale.to(advantages.dtype)
 
 
-@dataclass(frozen=True)
-class AdaptiveKL:
-    """Ziegler's controller of kl_beta; frozen, its fields are its whole state (save them, and load them).
+def adapted(kl_beta: float, kl: float, episodes: int, *, target: float, horizon: float) -> float:
+    """kl_beta after ``episodes`` more responses whose mean KL was ``kl`` nats.
 
-    ``target``: nats per response, the *sum* over its tokens; ``horizon``: responses over which kl_beta may
-    change by a fifth. Source: Ziegler et al. 2019, section 2.2 (there target 6, horizon 10000).
+    kl_beta *= 1 + clip(kl / target - 1, -0.2, 0.2) * episodes / horizon. The KL of a response is the *sum*
+    over its tokens: a mean over tokens is far below any target, and kl_beta would only ever fall.
+    ``horizon``, above 0.2 episodes: responses over which kl_beta may change by a fifth. ValueError when the
+    KL is not finite. Source: Ziegler et al. 2019, section 2.2 (there target 6, horizon 10000).
     """
-
-    kl_beta: float
-    target: float
-    horizon: float = 10_000.0
-
-    def __post_init__(self) -> None:
-        """Check the numbers: ValueError unless all are finite and above 0."""
-        for name, value in dataclasses.asdict(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value!r}; an adaptive KL penalty needs a number above 0.")
-
-    def next(self, kl_sequence_sum: float, episodes: int) -> AdaptiveKL:
-        """The controller after ``episodes`` more responses whose mean KL was ``kl_sequence_sum`` nats each.
-
-        kl_beta *= 1 + clip(kl / target - 1, -0.2, 0.2) * episodes / horizon. The KL of a response is the sum
-        over its tokens: a mean over tokens is far below any target, and kl_beta would only ever fall.
-        ValueError when the KL is not finite, or when one call could take kl_beta to 0.
-        """
-        if not math.isfinite(kl_sequence_sum):
-            raise ValueError(f"the KL is {kl_sequence_sum!r}; kl_beta cannot adapt to it.")
-        if LARGEST_CHANGE * episodes >= self.horizon:
-            raise ValueError(
-                f"{episodes} responses at once against a horizon of {self.horizon:g} could take kl_beta to "
-                f"0. Use a horizon above {LARGEST_CHANGE * episodes:g}, or smaller batches."
-            )
-        error = min(max(kl_sequence_sum / self.target - 1, -LARGEST_CHANGE), LARGEST_CHANGE)
-        return dataclasses.replace(self, kl_beta=self.kl_beta * (1 + error * episodes / self.horizon))
+    if not math.isfinite(kl):
+        raise ValueError(f"the KL is {kl!r}; kl_beta cannot adapt to it.")
+    error = min(max(kl / target - 1, -LARGEST_CHANGE), LARGEST_CHANGE)
+    return kl_beta * (1 + error * episodes / horizon)
 
 
 def _checked(form: str, logp: Tensor, ref_logp: Tensor, exact: Tensor | None, mask: Tensor) -> Tensor:
-    """The exact KL where the form needs it (zeros elsewhere), after a look at the arguments."""
+    """The exact KL, zeros where the form does not need it; ValueError for arguments that do not fit."""
+    if form not in KL_FORMS:
+        raise ValueError(f"kl is {form!r}; expected one of {', '.join(KL_FORMS)}.")
     require_same_shape(logp=logp, ref_logp=ref_logp, exact=exact, mask=mask)
-    if not needs_exact(form):
+    if not form.startswith("exact"):
         return torch.zeros_like(logp)
     if exact is None:
         raise ValueError(f"kl {form!r} needs the exact KL of every state [B, R]; exact is None.")
     return exact
 
 
-def _estimate(name: str, logp: Tensor, ref_logp: Tensor, exact: Tensor, mask: Tensor) -> Tensor:
-    """KL(pi || ref) per step by the estimator of that name, [B, R]; 0 with gradient 0 where masked."""
-    if name == "exact":
-        return torch.where(mask, exact, 0.0)
-    # divergence has the sampler on the left of the KL: here that is the policy, and the reference is `new`
-    log_ratio = surrogate.log_ratio(ref_logp, logp, mask)
-    return {"k1": divergence.k1, "k2": divergence.k2, "k3": divergence.k3}[name](log_ratio)
+def _log_ratio(logp: Tensor, ref_logp: Tensor, mask: Tensor) -> Tensor:
+    """log ref / pi per step, 0 where masked: divergences have the sampler, here the policy, on the left."""
+    return surrogate.log_ratio(ref_logp, logp, mask)
 
 
 def _require_finite(kl: Tensor) -> None:

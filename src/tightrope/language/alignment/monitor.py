@@ -1,12 +1,11 @@
-"""Watching for over-optimisation: the score that is trained on rises while what it stands for falls.
+"""Detects over-optimisation: the score that is trained on rises while the true quality falls.
 
     gold(d) = offset + d (alpha - beta log d),    d = sqrt(KL(policy || reference)), KL summed over a response
 
 is how the gold score follows a policy that PPO drives away from its reference (Gao, Schulman & Hilton 2022,
-arXiv 2210.10760; alpha hardly depends on the size of the reward model, beta falls with it). It has its top
-at d = exp(alpha / beta - 1), known before it is reached once the curve bends. Where the policy has hardly
-left the reference the curve of a real run is flatter than the law, and says little of the top: a point counts
-the more the farther out it lies.
+arXiv 2210.10760; alpha hardly depends on the size of the reward model, beta falls with it). Its top is
+at d = exp(alpha / beta - 1) and can be predicted once the curve bends. Near the reference the curve of a real
+run is flatter than the law and tells little about the top, so a point has the more weight the larger its d.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ FARTHEST = 10.0  # times the largest KL seen: a top beyond it is no prediction
 DRAWS = 2000
 POWER = 2.5  # a residual weighs (d / the largest d) to this power
 NEAR = 0.5  # of the predicted KL: d is then 0.71 of the top's, and gold within 5 % of what can be had
-WINDOWS = (8, 16, 32)  # evaluations over which proxy and gold are compared
+TREND_WINDOWS = (8, 16, 32)  # evaluations over which proxy and gold are compared
 SIGNIFICANCE = 0.0003  # one-sided, of each of the two slopes: the test is made at every evaluation
 
 
@@ -34,9 +33,9 @@ class Fit:
 
     ``peak_d`` and ``peak_kl`` = peak_d^2 (nats): the predicted top, inf where the curve does not bend down.
     ``peak_kl_low`` to ``peak_kl_high``: 80 % of the tops that the points allow, inf where more than a tenth
-    of them have none. ``decided``: the points tell where the top is, so that it may be shown and acted on.
+    of them have none. ``decided``: the points determine the top well enough to show it and to act on it.
     ``r2``: share of gold's variance explained, NaN for a constant one. ``reason``: why there is no fit, in
-    words, all numbers then NaN; empty when there is one.
+    words (all numbers are NaN then); empty when there is one.
     """
 
     alpha: float = math.nan
@@ -58,7 +57,7 @@ class Fit:
 
 
 def fit(points: Sequence[tuple[float, float]]) -> Fit:
-    """Fit Gao's curve to (KL, gold score) pairs; too few or too similar ones give a Fit that says so.
+    """Fit Gao's curve to (KL, gold score) pairs; too few or too similar ones give a Fit with the reason.
 
     KL in nats, per response. An estimate of it may be below 0 and counts as 0. Pairs that are not finite are
     left out. The offset, gold's score at the reference, is fitted like the rest.
@@ -102,12 +101,12 @@ def fit(points: Sequence[tuple[float, float]]) -> Fit:
 
 
 def _too_little(d: np.ndarray) -> str:
-    """Why the places [N] cannot bear a fit of three parameters; empty when they can."""
+    """Why three parameters cannot be fitted to points at these d [N]; empty when they can."""
     different, apart = len(np.unique(d)), d[d > 0]
     if different < FEWEST_POINTS:
         return f"{different} points at different KLs, at least {FEWEST_POINTS} are needed"
     if apart.max() < SPREAD * apart.min():
-        return f"the KLs reach from {apart.min() ** 2:.3g} to {apart.max() ** 2:.3g}, too near to each other"
+        return f"the KLs reach from {apart.min() ** 2:.3g} to {apart.max() ** 2:.3g}, too close to each other"
     return ""
 
 
@@ -123,8 +122,8 @@ def _possible_tops(
     scaled: np.ndarray, weights: np.ndarray, solution: np.ndarray, squares: float, size: np.ndarray
 ) -> np.ndarray:
     """The top's KL for parameters drawn as the fit leaves them in doubt, Student's t around it; [DRAWS],
-    ascending. All gold scores are taken for equally noisy, whatever they weigh. The draws are always the same
-    ones: a fit is a function of its points.
+    ascending. All gold scores are taken to be equally noisy, whatever their weight. The draws are always
+    the same ones: a fit is a function of its points.
     """
     total = float(np.sum(weights**2))
     freedom = max(1.0, total**2 / float(np.sum(weights**4)) - 3)  # points, had all the same weight, less 3
@@ -147,7 +146,7 @@ class Alarm:
 
 
 class Monitor:
-    """Judges a run from its KL, its score and, where there is a gold judge, the gold score.
+    """Watches a run: its KL, its score and, where there is a gold judge, the gold score.
 
     ``kl_budget``: nats per response at which the run stops, None for no limit. Each kind of alarm is given
     once in a run, but for the budget, which stops it whenever it is exceeded.
@@ -163,7 +162,7 @@ class Monitor:
 
     def add(self, kl: float, proxy: float, gold: float | None = None) -> list[Alarm]:
         """One update: KL to the reference (sum over a response, mean over responses), mean score that is
-        trained on, mean gold score. A gold score or proxy that is None or NaN (nothing could be judged) is
+        trained on, mean gold score. A gold score or proxy that is None or NaN (nothing was scored) is
         left out of the fit. ValueError for a KL that is not finite: then no budget holds.
         """
         if not math.isfinite(kl):
@@ -183,10 +182,6 @@ class Monitor:
             self._given += [alarm.kind for alarm in alarms if not alarm.stop]
         return alarms
 
-    def metrics(self) -> dict[str, float]:
-        """``objective/gold_predicted_peak_kl``, where the points decide it."""
-        return {"objective/gold_predicted_peak_kl": self.fit.peak_kl} if self.fit.decided else {}
-
     @property
     def newest_gold(self) -> float | None:
         """The gold score of the newest evaluation that gave one."""
@@ -198,7 +193,7 @@ class Monitor:
         return {"points": points, "given": list(self._given)}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a `state`; the budget stays the one of this monitor."""
+        """Continue from a `state`; the budget of this monitor stays."""
         self._points = [
             (kl, math.nan if proxy is None else proxy, gold) for kl, proxy, gold in state["points"]
         ]
@@ -221,10 +216,10 @@ class Monitor:
 
     def _opposed(self) -> Alarm | None:
         """Proxy up and gold down over the last evaluations, both beyond chance."""
-        judged = [(proxy, gold) for _, proxy, gold in self._points if math.isfinite(proxy)]
-        for window in WINDOWS:
-            proxy, gold = np.array(judged[-window:]).reshape(-1, 2).T
-            if len(proxy) < window or rising(proxy) >= SIGNIFICANCE or rising(-gold) >= SIGNIFICANCE:
+        scored = [(proxy, gold) for _, proxy, gold in self._points if math.isfinite(proxy)]
+        for window in TREND_WINDOWS:
+            proxy, gold = np.array(scored[-window:]).reshape(-1, 2).T
+            if len(proxy) < window or max(trend_p_value(proxy), trend_p_value(-gold)) >= SIGNIFICANCE:
                 continue
             text = (
                 f"Over {window} evaluations the score rose from {proxy[0]:.3g} to {proxy[-1]:.3g} while the "
@@ -235,7 +230,7 @@ class Monitor:
         return None
 
 
-def rising(values: np.ndarray) -> float:
+def trend_p_value(values: np.ndarray) -> float:
     """The chance that values [N >= 3] without a trend have a slope at least as steep upwards: Student's t
     test of the least-squares line over their order, one-sided.
     """

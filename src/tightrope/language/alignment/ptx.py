@@ -27,8 +27,8 @@ class Pretraining:
 
     @classmethod
     def make(cls, settings: AlignSettings, roles: Roles, notify: Notify) -> Pretraining:
-        """From the settings' ptx_data, each text cut to the tokens of a prompt and a response; ``notify`` is
-        told how many were.
+        """From the settings' ptx_data, each text cut to the tokens of a prompt and a response; ``notify``
+        receives how many were cut.
         """
         longest = settings.max_prompt_tokens + settings.max_new_tokens
         rows = read_rows(settings.ptx_data)

@@ -37,11 +37,11 @@ def sample_rows(
     and ``scores`` each function's own, None where there is none; ``kl`` to the reference in nats, k1 summed
     over the response; ``advantage`` the mean over its tokens, None where the response is masked (``counts``
     False); ``tokens`` its length, ``ended`` whether it closed itself with an EOS; ``extras`` what reward
-    functions logged. ``batch`` holds the rows of ``valid`` [B] alone.
+    functions logged. ``batch`` holds only the rows of ``valid`` [B].
     """
     responses = experience.responses
     log_ratio = experience.ref_logp - experience.logp
-    texts = [tokenizer.decode(ids, skip_special_tokens=True) for ids in experience.ids()]
+    texts = [tokenizer.decode(ids, skip_special_tokens=True) for ids in experience.ids]
     places = {row: place for place, row in enumerate(valid.nonzero()[:, 0].tolist())}
     rows = []
     for index, (prompt, text) in enumerate(zip(prompts, texts, strict=True)):
@@ -73,16 +73,16 @@ def read_samples(path: str | Path) -> list[dict[str, Any]]:
     path = Path(path)
     file = path / "samples.jsonl" if path.is_dir() else path
     if not file.is_file():
-        raise ValueError(f"{file} is not there: {path} is no run of tightrope align, or has not begun.")
+        raise ValueError(f"{file} is not there: {path} is not a run of tightrope align, or has not begun.")
     rows = read_lines(file)
     for number, row in enumerate(rows):
         if not _is_sample(row):
-            raise ValueError(f"{file}, row {number}, is no response as tightrope align records them.")
+            raise ValueError(f"{file}, row {number}, is not a response as tightrope align records it.")
     return rows
 
 
 def _is_sample(row: dict[str, Any]) -> bool:
-    """Whether a row has what tables show of it, whoever wrote the file."""
+    """Whether a row has everything that the tables show; the file may come from anywhere."""
     scores = row.get("scores")
     texts = (row.get("prompt"), row.get("response"))
     numbers = [row.get(name) for name in ("score", "kl", "advantage")]
@@ -98,7 +98,7 @@ def _is_sample(row: dict[str, Any]) -> bool:
 def spread(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
     """``count`` rows from the highest score to the lowest at even distances; those without a score come last.
 
-    A look at the best alone hides what happens to the others. ValueError for a count below 1.
+    The best alone would hide what happens to the others. ValueError for a count below 1.
     """
     if count < 1:
         raise ValueError(f"count is {count}, expected at least 1.")
@@ -128,30 +128,22 @@ def print_samples(
     heads = [*names, *(["score"] if len(names) > 1 else []), "KL", "advantage"]
     lines = []
     for row in rows:
-        figures = [row["scores"].get(name) for name in names]
-        figures += [row["score"]] if len(names) > 1 else []
-        lines.append([shown(row["prompt"], tail=True), shown(row["response"]), *map(figure, figures)])
-        lines[-1] += [figure(row["kl"]), figure(row["advantage"]) if row["counts"] else "masked"]
+        scores = [row["scores"].get(name) for name in names] + [row["score"]] * (len(names) > 1)
+        advantage = row["advantage"] if row["counts"] else "masked"
+        lines.append([row["prompt"], row["response"], *scores, row["kl"], advantage])
     _print_table(["prompt", "response"], heads, lines, stream, width, title, console)
 
 
-def print_comparison(
-    rows: Sequence[dict[str, Any]], stream: TextIO | None = None, *, width: int | None = None, title: str = ""
-) -> None:
-    """A table of responses before and after training: rows of ``prompt``, ``before``, ``after``, and, where
-    there is a reward, ``score_before`` and ``score_after``. ``stream`` and ``width`` as in `print_samples`.
+def print_comparison(rows: Sequence[dict[str, Any]], stream: TextIO | None = None, **options: Any) -> None:
+    """A table of responses before and after training: rows of ``prompt``, ``before`` and ``after``.
+
+    ``stream`` and ``options`` (``width``, ``title``) as in `print_samples`.
     """
-    scored = any(row.get("score_before") is not None or row.get("score_after") is not None for row in rows)
-    lines = []
-    for row in rows:
-        texts = [shown(row["prompt"], tail=True), shown(row["before"]), shown(row["after"])]
-        figures = [figure(row.get("score_before")), figure(row.get("score_after"))] if scored else []
-        lines.append(texts + figures)
-    heads = ["score before", "after"] if scored else []
-    _print_table(["prompt", "before", "after"], heads, lines, stream, width, title)
+    lines = [[row["prompt"], row["before"], row["after"]] for row in rows]
+    _print_table(["prompt", "before", "after"], [], lines, stream, **options)
 
 
-def shown(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
+def one_line(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
     """A text or messages in one short line for a table.
 
     Line ends and other characters that cannot be seen are written as Python writes them. The beginning is
@@ -165,7 +157,7 @@ def shown(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
     return "..." + line[3 - LONGEST :] if tail else line[: LONGEST - 3] + "..."
 
 
-def figure(value: float | None) -> str:
+def short_number(value: float | None) -> str:
     """A number in few characters, ``-`` for none."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
 
@@ -173,10 +165,10 @@ def figure(value: float | None) -> str:
 def _print_table(
     texts: list[str],
     figures: list[str],
-    lines: list[list[str]],
+    lines: list[list[Any]],
     stream: TextIO | None,
-    width: int | None,
-    title: str,
+    width: int | None = None,
+    title: str = "",
     console: Any = None,
 ) -> None:
     from rich.console import Console
@@ -185,11 +177,13 @@ def _print_table(
 
     table = Table(title=title or None, title_justify="left", show_lines=True, highlight=False)
     for name in texts:
-        table.add_column(Text(shown(name)), ratio=1, overflow="fold")
+        table.add_column(Text(one_line(name)), ratio=1, overflow="fold")
     for name in figures:
-        table.add_column(Text(shown(name)), justify="right", no_wrap=True)
-    for line in lines:
-        table.add_row(*[Text(cell) for cell in line])  # Text: brackets in a response are not markup
+        table.add_column(Text(one_line(name)), justify="right", no_wrap=True)
+    for prompt, *cells in lines:
+        shown = [one_line(x) if isinstance(x, str | list) else short_number(x) for x in cells]
+        # Text: brackets in a response are not markup
+        table.add_row(*map(Text, [one_line(prompt, tail=True), *shown]))
     console = console or Console(file=stream, width=width, markup=False, highlight=False)
     console.print(table)
 

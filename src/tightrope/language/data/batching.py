@@ -26,7 +26,7 @@ class Example:
 
 
 def positions(real: Tensor) -> Tensor:
-    """Position of every token [B, T]: real tokens count from 0, whatever the padding."""
+    """Position of every token [B, T]: real tokens count from 0, padding does not count."""
     return (real.long().cumsum(1) - 1).clamp(min=0)
 
 
@@ -75,7 +75,7 @@ def length_groups(real: Tensor, mask: Tensor) -> list[Tensor]:
 
 def used_columns(real: Tensor, mask: Tensor) -> tuple[int, int]:
     """The columns [left, right) of [B, P + R] whose states matter: from the first real prompt token to the
-    token before the last counting one, in whose state that is chosen.
+    token before the last counting one, whose state decides that last token.
     """
     prompt = real.shape[1] - mask.shape[1]
     any_prompt = real[:, :prompt].any(0).nonzero()
@@ -115,7 +115,7 @@ def row_of(examples: Sequence[Example]) -> Packed:
     return Packed(*(x[None] for x in (tokens, places, segments, learn)))
 
 
-def pack(examples: Sequence[Example], length: int) -> list[Packed]:
+def pack_rows(examples: Sequence[Example], length: int) -> list[Packed]:
     """All examples in rows of at most ``length`` tokens: the longest first, each into the fullest row that
     still holds it (best fit decreasing). ValueError for an example that fits no row.
     """

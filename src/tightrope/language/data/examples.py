@@ -55,7 +55,7 @@ def read_rows(source: Any, limit: int | None = None) -> list[Row]:
     (``id`` or ``id:split``; needs the package datasets), a list of strings, dicts or message lists, or
     anything that yields dicts, as datasets.Dataset does. Strings stay strings, and a list of messages is read
     as ``{"prompt": messages}``. ValueError when there is nothing to read, a row is none of these, or a column
-    stands in a file's row or header twice.
+    occurs twice in a file's row or header.
     """
     name = str(source) if isinstance(source, str | Path) else "data"
     if isinstance(source, str | Path):
@@ -90,9 +90,12 @@ def _read_file(path: Path) -> list[Any]:
         with open(path, encoding="utf-8-sig", newline="" if kind == ".csv" else None) as file:
             if kind == ".csv":
                 return _table(file, path)
-            lines = file.read().split("\n") if kind != ".json" else []
             if kind == ".json":
-                return _list(json.load(file, object_pairs_hook=partial(_unique, str(path))), path)
+                value = json.load(file, object_pairs_hook=partial(_unique, str(path)))
+                if not isinstance(value, list):
+                    raise ValueError(f"{path} holds {type(value).__name__}; expected a list of objects.")
+                return value
+            lines = file.read().split("\n")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not UTF-8 text ({error}). Convert it.") from error
     except (json.JSONDecodeError, csv.Error) as error:
@@ -115,7 +118,7 @@ def _object(line: str, place: str) -> Any:
 
 
 def _unique(place: str, pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of its pairs. ValueError for a key that is there twice: one of its values would be lost."""
+    """An object of its pairs. ValueError for a duplicate key: one of its values would be lost."""
     _each_once([key for key, _ in pairs], place)
     return dict(pairs)
 
@@ -126,12 +129,6 @@ def _each_once(names: Sequence[str], place: str) -> None:
         raise ValueError(
             f"{place} names {twice!r} twice; expected every column once. Rename one, or take it out."
         )
-
-
-def _list(value: Any, path: Path) -> list[Any]:
-    if not isinstance(value, list):
-        raise ValueError(f"{path} holds {type(value).__name__}; expected a list of objects.")
-    return value
 
 
 def _table(file: Iterable[str], path: Path) -> list[Any]:
@@ -158,8 +155,8 @@ def _read_hub(name: str) -> Any:
         ) from error
     if int(datasets.__version__.partition(".")[0]) < 4:
         raise ValueError(
-            f"The package datasets is {datasets.__version__}, which may run a script that lies beside the "
-            "data; expected 4 or newer, which runs none. Update it: pip install 'datasets>=4'."
+            f"The package datasets is {datasets.__version__}, which may run a script from the data's "
+            "folder; expected 4 or newer, which runs none. Update it: pip install 'datasets>=4'."
         )
     return datasets.load_dataset(name, split=split or "train")
 
@@ -177,10 +174,10 @@ def sft_examples(
 
     ``{"text"}`` or a plain string: every token is learnt.  ``{"prompt", "completion"}``, strings or lists of
     messages, and ``{"messages"}``: only completions and assistant turns, or everything with
-    ``on_completions`` off. The EOS that closes a text or a reply is learnt, whatever PAD may be; where none
+    ``on_completions`` off. The EOS that closes a text or a reply is learnt, with any PAD; where none
     is written, the first of ``eos`` is appended. Rows over ``max_tokens`` are cut at the end, rows with
-    nothing left to learn are left out, and ``notify`` is told how many. ValueError names the row that is
-    empty or lacks its columns.
+    nothing left to learn are left out, and ``notify`` receives how many. ValueError names the row that
+    is empty or lacks its columns.
     """
     encoder, cut = Encoder(tokenizer, eos), 0
     examples: list[Example] = []
@@ -192,7 +189,7 @@ def sft_examples(
         example = Example(tuple(tokens[:max_tokens]), tuple(learn[:max_tokens]))
         if any(example.learn):
             examples.append(example)
-    _tell(notify, len(rows), len(examples), cut, max_tokens, "nothing to learn")
+    _report(notify, len(rows), len(examples), cut, max_tokens, "nothing to learn")
     return examples
 
 
@@ -208,7 +205,7 @@ def preference_pairs(
     contain their prompt; strings or lists of messages.
 
     Each text ends with its EOS, as a sampled response does. Texts over ``max_tokens`` are cut at the end,
-    pairs whose texts are equal (then, or from the start) are left out, and ``notify`` is told how many.
+    pairs whose texts are equal (then, or from the start) are left out, and ``notify`` receives how many.
     ValueError names the row that is empty or lacks its columns.
     """
     encoder, cut = Encoder(tokenizer, eos), 0
@@ -222,7 +219,7 @@ def preference_pairs(
         if chosen != rejected:
             (head, learnt), common = both[0][0], formats.shared(chosen, rejected)
             pairs.append(Pair(chosen, rejected, common if learnt else min(len(head), common)))
-    _tell(notify, len(rows), len(pairs), cut, max_tokens, "two equal texts")
+    _report(notify, len(rows), len(pairs), cut, max_tokens, "two equal texts")
     return pairs
 
 
@@ -233,8 +230,8 @@ def read_prompts(
 
     Messages end with the assistant's header, so that the response is its turn. Every other column goes to the
     reward functions. Prompts over ``max_tokens`` lose their beginning (the tokenizer's opening stays, and
-    ``shown`` is what is left of a string; a chat is shown whole), and ``notify`` is told how many. ValueError
-    names a row that is empty or has no prompt.
+    ``shown`` is what is left of a string; a chat is shown whole), and ``notify`` receives how many.
+    ValueError names a row that is empty or has no prompt.
     """
     encoder, cut, chats = Encoder(tokenizer), 0, 0
     prompts: list[Prompt] = []
@@ -242,7 +239,7 @@ def read_prompts(
         columns, place = {"prompt": row} if isinstance(row, str) else row, f"data[{number}]"
         if not formats.has(columns, "prompt"):
             raise formats.missing(columns, place, "prompt")
-        shown = formats.content(columns, "prompt", place)
+        shown = formats.read_content(columns, "prompt", place)
         if isinstance(shown, str):
             tokens, opening = encoder.text(shown), encoder.opening[: max_tokens - 1]
         else:
@@ -263,8 +260,8 @@ def read_prompts(
     return prompts
 
 
-def _tell(notify: Notify, rows: int, kept: int, cut: int, max_tokens: int, why: str) -> None:
-    """Say how many rows were cut and left out. ValueError when none is left."""
+def _report(notify: Notify, rows: int, kept: int, cut: int, max_tokens: int, why: str) -> None:
+    """Report how many rows were cut or left out. ValueError when none is left."""
     if not kept:
         raise ValueError(
             f"None of the {rows} rows is left: after the cut at max_tokens {max_tokens} each has {why}. "
@@ -280,7 +277,8 @@ def _tell(notify: Notify, rows: int, kept: int, cut: int, max_tokens: int, why: 
 
 
 def hold_out_prompts(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prompt]]:
-    """Prompts to train on and ``count`` (a quarter at most) that never are, not even as equals of themselves.
+    """Prompts to train on, and ``count`` (a quarter at most) that are held out together with their
+    duplicates.
 
     ValueError when there are too few different ones.
     """

@@ -10,7 +10,7 @@ Pieces = list[tuple[list[int], bool]]  # tokens, and whether they are learnt
 
 
 class Encoder:
-    """A tokenizer with its habits made explicit: what it puts before a text, and what closes one.
+    """A tokenizer, and what it puts before and after a text.
 
     ``eos`` are the ids that end a response; the first is appended where a text does not end with one.
     Prompt and reply are tokenised apart, at the place where sampling parts them.
@@ -35,7 +35,7 @@ class Encoder:
 
     def reply(self, prompt: str, completion: str) -> tuple[list[int], list[int]]:
         """Prompt and completion of plain text: together, as the tokenizer writes them, where that leaves the
-        prompt as it is; apart where a token would reach across.
+        prompt as it is; apart where a token would span both.
         """
         before, whole = self.text(prompt), self.text(prompt + completion)
         apart = whole[: len(before)] != before
@@ -65,7 +65,7 @@ class Encoder:
             )
         try:
             text = str(self.tokenizer.apply_chat_template(messages, tokenize=False, **options))
-        except Exception as error:  # whatever a template raises: it is a program of the model's authors
+        except Exception as error:  # a template is a program of the model's authors and may raise anything
             raise ValueError(f"{place}: the chat template refuses these messages ({error}).") from error
         return encodable(text, f"the chat of {place}")
 
@@ -102,7 +102,7 @@ class Encoder:
         return shared(whole, asked), len(until)
 
     def prompt(self, messages: Messages, place: str, *, tools: Any = None) -> list[int]:
-        """A chat as far as the assistant's turn to speak, or to go on with a turn that it has begun."""
+        """A chat up to the assistant's next turn, or up to where a turn that it has begun continues."""
         begun = messages[-1]["role"] == "assistant"
         options = {"continue_final_message": True} if begun else {"add_generation_prompt": True}
         return self.bare(self.render(messages, place, tools=tools, **options))
@@ -111,17 +111,17 @@ class Encoder:
 def supervised(row: dict[str, Any], encoder: Encoder, place: str) -> Pieces:
     """The pieces of a row for supervised fine-tuning."""
     if has(row, "prompt", "completion"):
-        prompt, completion = content(row, "prompt", place), content(row, "completion", place)
+        prompt, completion = read_content(row, "prompt", place), read_content(row, "completion", place)
         if isinstance(prompt, str) and isinstance(completion, str):
             return answered(encoder, prompt, completion)
         asked = as_messages(prompt, "user")
         messages = [*asked, *as_messages(completion, "assistant")]
         return encoder.chat(messages, place, first=len(asked), tools=row.get("tools"))
     if has(row, "messages"):
-        messages = as_messages(content(row, "messages", place), "user")
+        messages = as_messages(read_content(row, "messages", place), "user")
         return encoder.chat(messages, place, tools=row.get("tools"))
     if has(row, "text"):
-        text = content(row, "text", place)
+        text = read_content(row, "text", place)
         if isinstance(text, str):
             return [(encoder.closed(encoder.text(text)), True)]
         raise ValueError(f"text of {place} is a list; expected a string. Chats belong into messages.")
@@ -132,8 +132,8 @@ def preference(row: dict[str, Any], encoder: Encoder, place: str) -> list[Pieces
     """The pieces of the chosen and of the rejected text of a row."""
     if not has(row, "chosen", "rejected"):
         raise missing(row, place, "chosen and rejected, and prompt unless both contain it")
-    prompt = content(row, "prompt", place) if has(row, "prompt") else None
-    replies = [content(row, column, place) for column in ("chosen", "rejected")]
+    prompt = read_content(row, "prompt", place) if has(row, "prompt") else None
+    replies = [read_content(row, column, place) for column in ("chosen", "rejected")]
     texts = [reply for reply in replies if isinstance(reply, str)]
     if len(texts) == 2 and not isinstance(prompt, list):
         if prompt is None:
@@ -174,7 +174,7 @@ def shared(first: Sequence[Any], second: Sequence[Any]) -> int:
 
 
 def has(row: dict[str, Any], *columns: str) -> bool:
-    """Whether a row has all of these columns; one that holds None is not there."""
+    """Whether a row has all of these columns; one that holds None does not count."""
     return all(row.get(column) is not None for column in columns)
 
 
@@ -189,7 +189,7 @@ def as_messages(value: str | Messages, role: str) -> Messages:
     return [{"role": role, "content": value}] if isinstance(value, str) else value
 
 
-def content(row: dict[str, Any], column: str, place: str) -> str | Messages:
+def read_content(row: dict[str, Any], column: str, place: str) -> str | Messages:
     """A string of encodable text that is not blank, or a list of messages. ValueError names the row and what
     is wrong.
     """

@@ -55,6 +55,11 @@ def at_head(sampling: Sampling, head: nn.Linear) -> Sampling:
     return dataclasses.replace(sampling, temperature=sampling.temperature / factor)
 
 
+def next_logits(hidden: Tensor, head: nn.Linear, sampling: Sampling) -> Tensor:
+    """Logits [N, V] of the distribution of the token that follows hidden states [N, d]."""
+    return shape_logits(nn.functional.linear(hidden, head.weight, head.bias), at_head(sampling, head))
+
+
 class TokenStatistics(NamedTuple):
     """Of N tokens: log-probability, entropy of the state, KL(policy || reference) of the state, and the
     token's log-probability by the reference; nats.

@@ -1,4 +1,4 @@
-"""Responses from a causal language model: one prefill of each prompt, then a token a step from the KV cache.
+"""Responses from a causal language model: a prefill of each prompt, then one token per step by KV cache.
 
 Each row's tokens come from uniform numbers of its own, drawn beforehand, so that a response does not depend
 on which rows are sampled beside it or have finished before it.
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
-from tightrope.language.generation.distribution import Sampling, at_head, shape_logits
+from tightrope.language.generation.distribution import Sampling, next_logits
 from tightrope.language.model.parts import parts
 
 # A forward pass takes its cache under the old name up to transformers 5.23. From 5.24 on the name is new, and
@@ -45,9 +45,10 @@ class Responses:
     support: Tensor | None
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Completions:
-    """Responses to prompts. ``tokens``, ``real``: prompt and response, [B, P + R]; ``seconds``: to sample.
+    """Responses to prompts. ``tokens``, ``real``: prompt and response, [B, P + R]; ``ids``: of each response,
+    padding left out; ``seconds``: to sample.
 
     ``lower``: what enters the trunk's upper part, [B, P + R, d], where that was computed.
     """
@@ -55,13 +56,9 @@ class Completions:
     tokens: Tensor
     real: Tensor
     responses: Responses
+    ids: list[list[int]]
     seconds: float
-    lower: Tensor | None
-
-    def ids(self) -> list[list[int]]:
-        """The token ids of each response, padding left out."""
-        pairs = zip(self.responses.tokens, self.responses.mask, strict=True)
-        return [tokens[mask].tolist() for tokens, mask in pairs]
+    lower: Tensor | None = None
 
 
 @torch.no_grad()
@@ -121,9 +118,8 @@ def sample(
 def draw(
     hidden: Tensor, head: nn.Linear, sampling: Sampling, uniforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """One token a row from hidden states [N, d]: ids, log-probabilities [N], and with top-k its support."""
-    logits = shape_logits(nn.functional.linear(hidden, head.weight, head.bias), at_head(sampling, head))
-    support = None
+    """One token per row from hidden states [N, d]: ids, log-probabilities [N], and with top-k its support."""
+    logits, support = next_logits(hidden, head, sampling), None
     if sampling.top_k:
         logits, support = logits.topk(min(sampling.top_k, logits.shape[1]), dim=1)
     logs = logits.log_softmax(1)
@@ -137,7 +133,7 @@ def draw(
     return chosen, own, support
 
 
-class Step(NamedTuple):
+class CachedPass(NamedTuple):
     """One forward pass: ``hidden`` [B, T, d], the last hidden states, and the cache after it."""
 
     hidden: Tensor
@@ -146,7 +142,7 @@ class Step(NamedTuple):
 
 def cached_forward(
     base: nn.Module, tokens: Tensor, attention_mask: Tensor, positions: Tensor, cache: Any = None
-) -> Step:
+) -> CachedPass:
     """Run ``base`` on ``tokens`` [B, T] with a cache. None starts a new one; a given one grows in place.
 
     ``attention_mask`` [B, T + cached]: 1 for real tokens. ``positions`` [B, T].
@@ -156,4 +152,4 @@ def cached_forward(
     out = base(tokens, attention_mask=attention_mask, position_ids=positions, use_cache=True, **given)
     # asked for by name in this order: reading the old name from a new output warns
     after = out.cache if hasattr(out, NEW) else out.past_key_values
-    return Step(out.last_hidden_state, after)
+    return CachedPass(out.last_hidden_state, after)

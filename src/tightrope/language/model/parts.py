@@ -3,7 +3,7 @@
     logits = factor * head(base(tokens))
 
 Granite divides the logits by a constant and Cohere multiplies them; for most models the factor is 1. It is
-measured once and kept at the head, where `generation.distribution.at_head` reads it.
+measured once and stored on the head, where `generation.distribution.at_head` reads it.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import torch
 from torch import Tensor, nn
 
 LAYER_NAMES = ("layers", "h", "blocks")
-WINDOWS = ("sliding_window", "attention_chunk_size")  # how far back a layer of a config may look
-FACTOR = "logit_factor"  # of a head that has been looked at
+WINDOW_FIELDS = ("sliding_window", "attention_chunk_size")  # how far back a layer of a config may look
+FACTOR = "logit_factor"  # an attribute of a head whose factor is known
 SPAN = 100.0  # logits far beyond those of real models: a soft cap bends them
-TOLERANCE = 1e-3  # relative; the same operations twice, and one multiplication
+FACTOR_TOLERANCE = 1e-3  # relative; the same operations twice, and one multiplication
 
 
 class Parts(NamedTuple):
-    """What a causal language model is made of: head(base(tokens)), times a factor kept at the head, are its
-    logits.
+    """The parts of a causal language model. Its logits are head(base(tokens)) times a factor that is stored
+    on the head.
     """
 
     base: nn.Module
@@ -43,7 +43,7 @@ def parts(model: Any) -> Parts:
             for name in LAYER_NAMES:
                 layers = getattr(owner, name, None)
                 if isinstance(layers, nn.ModuleList):
-                    examine(model, base, head)
+                    measure_factor(model, base, head)
                     return Parts(base, layers, head)
     raise ValueError(
         f"{type(model).__name__} is not a decoder-only model whose layers and head can be found. Llama, "
@@ -52,7 +52,7 @@ def parts(model: Any) -> Parts:
 
 
 def context_length(model: Any) -> int | None:
-    """How many positions the model knows; None where it does not say."""
+    """How many positions the model knows; None where its config does not tell."""
     for name in ("max_position_embeddings", "n_positions", "n_ctx"):
         if (found := getattr(model.config, name, None)) is not None:
             return int(found)
@@ -64,7 +64,7 @@ def attention_window(model: Any) -> int | None:
     config = model.config.get_text_config()
     if all(kind == "full_attention" for kind in getattr(config, "layer_types", None) or ["unknown"]):
         return None
-    sizes = [size for name in WINDOWS if (size := getattr(config, name, None)) is not None]
+    sizes = [size for name in WINDOW_FIELDS if (size := getattr(config, name, None)) is not None]
     return min(sizes, default=None)
 
 
@@ -76,12 +76,13 @@ def parameter_counts(model: Any, trained: Iterable[nn.Parameter]) -> tuple[int, 
 
 
 @torch.no_grad()
-def examine(model: Any, base: nn.Module, head: nn.Linear) -> None:
-    """Find out once, from a few tokens, that the model's logits are factor * head(base(tokens)), and keep the
-    factor at the head.
+def measure_factor(model: Any, base: nn.Module, head: nn.Linear) -> None:
+    """Check once, on a few tokens, that the model's logits are factor * head(base(tokens)), and store the
+    factor on the head.
 
-    Raises ValueError for a model that does anything else, as a soft cap, or whose head does not read hidden
-    states of the model's own width. On the meta device, where there are no numbers, only the width is seen.
+    Raises ValueError for a model that does anything else, such as a soft cap, or whose head does not read
+    hidden states of the model's own width. On the meta device, where there are no numbers, only the width is
+    checked.
     """
     width = model.config.get_text_config().hidden_size
     if head.in_features != width:
@@ -101,7 +102,7 @@ def examine(model: Any, base: nn.Module, head: nn.Linear) -> None:
 
 
 def _factor(model: Any, base: nn.Module, head: nn.Linear) -> float:
-    """What the model multiplies its head's output by; the output is replaced by known numbers to see it."""
+    """What the model multiplies its head's output by, measured by replacing that output by known numbers."""
     reads: list[Tensor] = []
     given = torch.linspace(-SPAN, SPAN, head.out_features, device=head.weight.device)
 
@@ -134,8 +135,8 @@ def _factor(model: Any, base: nn.Module, head: nn.Linear) -> float:
 
 
 def _apart(x: Tensor, y: Tensor) -> bool:
-    """Whether two tensors differ by more than rounding; NaN, which others look for, does not count."""
-    return bool((x - y).abs().max() > TOLERANCE * y.abs().max())
+    """Whether two tensors differ by more than rounding. NaN is not counted; other checks find it."""
+    return bool((x - y).abs().max() > FACTOR_TOLERANCE * y.abs().max())
 
 
 def _seen(logits: Tensor, place: float) -> float:

@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from tightrope.language.model.load import read_object, read_tensors
 from tightrope.language.model.lora import (
     Adapted,
@@ -19,9 +21,11 @@ from tightrope.runs.durable import atomic_folder, writing
 
 
 def save_adapter(
-    model: Any, name: str, folder: Path, *, base_model: str, task_type: str = "CAUSAL_LM"
+    model: Any, name: str, folder: Path, *, base_model: str, score: Tensor | None = None
 ) -> None:
-    """Write an adapter as PEFT reads it: adapter_config.json and adapter_model.safetensors."""
+    """Write an adapter as PEFT reads it: adapter_config.json and adapter_model.safetensors. With ``score``,
+    a head [1, d], it is the adapter of a model that scores texts.
+    """
     from safetensors.torch import save_file
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -30,7 +34,7 @@ def save_adapter(
     numbers = {int(word) for path, _ in modules for word in path.split(".") if word.isdigit()}
     config = {
         "peft_type": "LORA",
-        "task_type": task_type,
+        "task_type": "CAUSAL_LM" if score is None else "SEQ_CLS",
         "base_model_name_or_path": base_model,
         "r": rank,
         "lora_alpha": modules[0][1]._scale[name] * rank,
@@ -41,7 +45,11 @@ def save_adapter(
         "layers_to_transform": sorted(numbers),
         "inference_mode": True,
     }
-    state = {key: tensor.cpu().contiguous().clone() for key, tensor in adapter_state(model, name).items()}
+    state = adapter_state(model, name)
+    if score is not None:
+        config["modules_to_save"] = ["score"]
+        state["base_model.model.score.weight"] = score
+    state = {key: tensor.cpu().contiguous().clone() for key, tensor in state.items()}
     with writing(folder):
         save_file(state, folder / "adapter_model.safetensors", metadata={"format": "pt"})
         (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
@@ -67,7 +75,7 @@ def load_adapter(model: Any, name: str, folder: Path) -> None:
 
 def save_model(model: Any, tokenizer: Any, run: Path, adapter: str | None, base_model: str) -> None:
     """RUN/model for AutoModelForCausalLM.from_pretrained, tokenizer and chat template included. An adapter is
-    folded in, and lies in RUN/adapter for PEFT as well; ``base_model`` is what it belongs to.
+    folded in, and is also written to RUN/adapter for PEFT; ``base_model`` is the model it belongs to.
     """
     write_model(model, tokenizer, run / "model", adapter)
     if adapter is not None:

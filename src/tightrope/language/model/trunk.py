@@ -1,4 +1,4 @@
-"""A decoder cut in two: what lies below the first adapted layer is computed once and shared by every role.
+"""A decoder cut in two: the part below the first adapted layer is computed once and shared by every role.
 
 lower(tokens) -> hidden states that enter layer ``cut``        frozen, the same for all roles and epochs
 upper(hidden) -> hidden states after the final norm            once a role, with its adapter
@@ -17,18 +17,18 @@ from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
 from tightrope.language.model import lora
-from tightrope.language.model.parts import WINDOWS, parts
+from tightrope.language.model.parts import WINDOW_FIELDS, parts
 
 FINAL_NORMS = ("norm", "ln_f", "final_layer_norm")
 NARROW = 3  # tokens of a window while the halves are tried
-TOLERANCE = 1e-4  # relative; the two halves are the same operations in the same order
+HALVES_TOLERANCE = 1e-4  # relative; the two halves are the same operations in the same order
 
 
 class Trunk:
     """The forward pass of one causal language model without its head, in one piece or in two.
 
     ``cut`` is the number of layers in the lower part; 0 where the model cannot be cut, or need not be.
-    Layers that differ in their attention keep their own in either part.
+    Each layer keeps its own kind of attention.
     """
 
     def __init__(self, model: Any, cut: int = 0, *, checkpointing: bool = False) -> None:
@@ -62,9 +62,9 @@ class Trunk:
 
     @torch.no_grad()
     def _agrees(self, cut: int) -> bool:
-        """Whether two halves compute what the whole does, on a padded batch of this very model.
+        """Whether two halves give the same as the whole, on a padded batch of this model.
 
-        Windows of attention are narrowed for it, so that a layer with another's is seen in a few tokens.
+        Attention windows are narrowed meanwhile, so that a few tokens show a layer with a wrong window.
         """
         device = next(self.model.parameters()).device
         tokens = torch.arange(24, device=device).reshape(2, 12) % self.model.config.vocab_size
@@ -77,9 +77,9 @@ class Trunk:
                 whole = _run(base, real, input_ids=tokens)
                 both = _run(upper, real, inputs_embeds=_run(lower, real, input_ids=tokens))
         except (TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError):
-            return False  # an architecture whose layers need more than the layer before them gives
+            return False  # the layers of this architecture need more than the output of the layer before
         gap = (whole - both)[real].abs().max() / whole[real].abs().max()
-        return bool(gap <= (TOLERANCE if whole.dtype == torch.float32 else 0.05))
+        return bool(gap <= (HALVES_TOLERANCE if whole.dtype == torch.float32 else 0.05))
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def _run(base: nn.Module, real: Tensor, **inputs: Tensor) -> Tensor:
 
 
 def _halves(base: nn.Module, layers: nn.ModuleList, cut: int) -> tuple[nn.Module, nn.Module]:
-    """Two shallow copies of the base with a part of its layers each; every weight is the base's own."""
+    """Two shallow copies of the base, each with some of its layers; they share the weights of the base."""
     lower, upper = _shallow(base), _shallow(base)
     for half, own in ((lower, slice(0, cut)), (upper, slice(cut, len(layers)))):
         name = next(name for name, module in base.named_children() if module is layers)
@@ -130,7 +130,7 @@ def _halves(base: nn.Module, layers: nn.ModuleList, cut: int) -> tuple[nn.Module
 @contextlib.contextmanager
 def _narrow_windows(config: Any) -> Iterator[None]:
     """Inside, layers that look back over a window of tokens look over a narrow one."""
-    before = {name: getattr(config, name, None) for name in WINDOWS}
+    before = {name: getattr(config, name, None) for name in WINDOW_FIELDS}
     for name, size in before.items():
         if size is not None:
             setattr(config, name, NARROW)
@@ -149,7 +149,7 @@ def _shallow(module: nn.Module) -> nn.Module:
 
 
 class _Nothing(nn.Module):
-    """Stands for an embedding that has been added already."""
+    """Takes the place of an embedding that is already added."""
 
     def forward(self, positions: Tensor) -> Tensor:
         return torch.zeros((), device=positions.device)

@@ -3,34 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from tightrope.algorithms.batch import Batch
 from tightrope.language.data.batching import length_groups, used_columns
-from tightrope.language.generation.distribution import token_statistics
 from tightrope.language.policy.roles import Roles
-from tightrope.language.policy.rollout import FirstPass, Inputs
+from tightrope.language.policy.rollout import FirstPass, ResponseInputs
 
 
+@dataclass
 class PolicyModel:
     """What ppo.update trains: Batch -> FirstPass, each [B, R]; padding is cut off before the forward pass.
 
-    ``exact``: also the exact KL to the reference of every state. ``critic_only``: no gradient reaches the
-    policy. ``first_pass``: the rollout's own pass with its graph, used for the first call instead of a
-    forward pass.
+    ``critic_only``: no gradient reaches the policy. ``first_pass``: the rollout's own pass with its graph,
+    used for the first call instead of a forward pass. The KL is computed where the batch holds the
+    reference's hidden states.
     """
 
-    def __init__(
-        self,
-        roles: Roles,
-        *,
-        exact: bool = False,
-        critic_only: bool = False,
-        first_pass: FirstPass | None = None,
-    ) -> None:
-        self.roles, self.exact, self.critic_only, self.first_pass = roles, exact, critic_only, first_pass
+    roles: Roles
+    critic_only: bool = False
+    first_pass: FirstPass | None = None
 
     def __call__(self, part: Batch) -> FirstPass:
         """Log-probabilities, entropies and KL of the policy, and the critic's values, where the mask is
@@ -53,7 +48,7 @@ class PolicyModel:
 
     def _pass(self, part: Batch) -> FirstPass:
         """One forward pass over some rows."""
-        roles, mask, inputs = self.roles, part.mask, Inputs(**part.inputs)
+        roles, mask, inputs = self.roles, part.mask, ResponseInputs(**part.inputs)
         columns, length = mask.shape[1], inputs.tokens.shape[1]
         left, right = used_columns(inputs.real, mask)
         tokens, real = inputs.tokens[:, left:right], inputs.real[:, left:right]
@@ -66,14 +61,12 @@ class PolicyModel:
 
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.critic_only):
             hidden = roles.policy.hidden(tokens, real, lower)
-        reference = inputs.ref_hidden if self.exact else None
-        found = token_statistics(
-            steps(hidden), roles.trunk.parts.head, part.actions[mask], roles.sampling,
+        found = roles.statistics(
+            steps(hidden),
+            tokens=part.actions[mask],
             support=None if inputs.support is None else inputs.support[mask],
-            reference=None if reference is None else reference[mask],
-            reference_head=roles.reference.trunk.parts.head,
-            ahead=roles.settings.logp_alone,
-        )  # fmt: skip
+            reference=None if inputs.ref_hidden is None else inputs.ref_hidden[mask],
+        )
         values = found.logp.new_zeros(len(found.logp))
         if roles.critic_head is not None:
             critic = hidden if roles.critic is None else roles.critic.hidden(tokens, real, lower)

@@ -9,7 +9,8 @@ reward     adapter "reward" and a head | a separate model | a function of the te
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from tightrope.language.generation.distribution import Sampling
-from tightrope.language.memory import available_memory, check, job_of, ledger, reward_model_bytes
+from tightrope.language.generation.distribution import Sampling, token_statistics
+from tightrope.language.memory import job_of, require_memory, reward_model_bytes
 from tightrope.language.model import lora
 from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, require_device
 from tightrope.language.model.packaged import find_model
@@ -43,6 +44,16 @@ class Roles:
     settings: AlignSettings
     sampling: Sampling
     eos: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Statistics of tokens, with all that a rollout and its update must have in common."""
+        self.statistics = functools.partial(
+            token_statistics,
+            head=self.trunk.parts.head,
+            sampling=self.sampling,
+            reference_head=self.reference.trunk.parts.head,
+            ahead=self.settings.logp_alone,
+        )
 
     @property
     def trunk(self) -> Trunk:
@@ -103,18 +114,17 @@ def make_roles(
     *,
     own_reward: bool = False,
 ) -> Roles:
-    """Load and arrange the models. ``reward_adapter``: a reward model's adapter for this very trunk;
-    ``own_reward``: the reward is a model with a trunk of its own, which will stand beside them.
+    """Load and arrange the models. ``reward_adapter``: a reward model's adapter for the same trunk;
+    ``own_reward``: the reward is a model with a trunk of its own, which will be loaded beside them.
 
     The memory ledger is handed to ``notify`` before anything large is loaded; what cannot fit is a
     ValueError.
     """
     require_device(settings.device)
     folder, dtype, device = find_model(settings.model), getattr(torch, settings.dtype), settings.device
-    beside = judges_of(settings, own_reward)
     guessed = own_reward and not Path(settings.reward or "-").is_dir()
     kind = "separate" if guessed else "none" if reward_adapter is None else "adapter"
-    present_memory(folder, settings, kind, notify, beside)
+    _require_memory(folder, settings, kind, notify, own_reward)
     tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
     stops, cut = eos_ids(model, tokenizer), 0
     if settings.tune == "lora":
@@ -140,41 +150,32 @@ def make_roles(
     head = None
     if settings.critic != "none":
         head = nn.Linear(model.config.hidden_size, 1).to(device)
-        nn.init.zeros_(head.weight)  # the first values are 0, whatever the hidden states
+        nn.init.zeros_(head.weight)  # the first values are 0 for any hidden state
         nn.init.zeros_(head.bias)
     sampling = Sampling(settings.temperature, settings.top_k, stops if settings.ignore_eos else ())
     return Roles(tokenizer, policy, reference, critic, head, settings, sampling, stops)
 
 
-def judges_of(settings: AlignSettings, own_reward: bool) -> list[Path]:
-    """The folders of reward models that the settings name and that have a trunk of their own: the reward
-    with ``own_reward``, the gold judge always.
-    """
-    named = [settings.reward if own_reward else None, settings.gold]
-    return [Path(name) for name in named if name and Path(name).is_dir()]
-
-
-def present_memory(
-    folder: str,
-    settings: AlignSettings,
-    reward: str,
-    notify: Callable[[str], None],
-    judges: Sequence[Path] = (),
+def _require_memory(
+    folder: str, settings: AlignSettings, reward: str, notify: Callable[[str], None], own_reward: bool
 ) -> None:
-    """Say what the job will take, and refuse it with advice when it cannot fit: before weights are loaded.
+    """Report what the job will take, and refuse it with advice when it cannot fit: before weights are loaded.
 
-    ``judges``: folders of reward models with a trunk of their own, each of any size.
+    The gold judge, and the reward with ``own_reward``, have a trunk of their own where they are folders.
     """
     from transformers import AutoConfig
 
     rows = min(settings.update.micro_batch_size or settings.update.minibatch_size, settings.batch_size)
     texts = rows * settings.ptx_per_response if settings.ptx_weight else 0
-    extra = texts * (settings.max_prompt_tokens + settings.max_new_tokens)
-    sizes = tuple((judge.resolve().name, reward_model_bytes(judge)) for judge in judges)
-    job = job_of(settings, reward=reward, extra_tokens=extra, judges=sizes)
-    found = ledger(pretrained(AutoConfig, folder), job)
-    notify(found.text())
-    check(found, available_memory(settings.device))
+    named = (settings.reward if own_reward else None, settings.gold)
+    judges = [Path(name) for name in named if name and Path(name).is_dir()]
+    job = job_of(
+        settings,
+        reward=reward,
+        extra_tokens=texts * (settings.max_prompt_tokens + settings.max_new_tokens),
+        judges=tuple((judge.resolve().name, reward_model_bytes(judge)) for judge in judges),
+    )
+    require_memory(pretrained(AutoConfig, folder), job, settings.device, notify)
 
 
 def lowest_layer(model: Any, name: str) -> int:

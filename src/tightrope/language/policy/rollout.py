@@ -19,7 +19,7 @@ class FirstPass(Evaluation):
     kl: Tensor
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Experience(Completions):
     """Completions, and what the roles compute for them.
 
@@ -39,19 +39,9 @@ class Experience(Completions):
     first_pass: FirstPass | None
     short_of_memory: bool = False
 
-    @property
-    def last(self) -> Tensor:
-        """[B]: the column of each response's last real token."""
-        return self.responses.mask.sum(1) - 1
-
-    def take_first_pass(self) -> FirstPass | None:
-        """The first pass, handed over: where memory runs out, nothing else may hold on to its graph."""
-        taken, self.first_pass = self.first_pass, None
-        return taken
-
 
 @dataclass(frozen=True)
-class Inputs:
+class ResponseInputs:
     """The keys of ``Batch.inputs`` for responses. Rows first.
 
     ``tokens``, ``real`` [B, P + R]; ``ref_logp`` [B, R]; ``row`` [B]: the row in the rollout. ``lower``,
@@ -66,7 +56,3 @@ class Inputs:
     ref_hidden: Tensor | None = None
     support: Tensor | None = None
     ptx: Tensor | None = None
-
-    def as_dict(self) -> dict[str, Tensor]:
-        """Those that are there, by name."""
-        return {name: x for name, x in vars(self).items() if x is not None}

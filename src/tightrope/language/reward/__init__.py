@@ -1,1 +1,1 @@
-"""Who judges responses."""
+"""Rewards: functions, reward models, and the judge that joins them."""

@@ -1,8 +1,8 @@
-"""One call of a reward function: what it is given, how long it may take, and what came back.
+"""One batch for every reward function: what each is given, how long it may take, and what came back.
 
 Python cannot kill a thread. A call that is not back at its deadline is left behind in a daemon thread, which
 stops neither the program nor the end of the process; what it returns later is thrown away. A plain function
-is not called again before it is back, so that at most one thread a function is lost.
+is not called again before it is back, so that at most one thread per function is lost.
 """
 
 from __future__ import annotations
@@ -17,17 +17,16 @@ import queue
 import threading
 import traceback
 import weakref
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
 from tightrope.errors import TightropeError
 
-T = TypeVar("T")
 Text = str | list[dict[str, Any]]
 RewardFunction = Callable[..., Any]
 FaultKind = Literal["exception", "length", "type", "not finite", "timeout", "none"]
@@ -52,76 +51,188 @@ class Fault:
 
 
 class NoScores(TightropeError):
-    """What a function returned is no list of scores; the message follows the function's name."""
+    """What a function returned is not a list of scores; the message follows the function's name."""
 
     def __init__(self, kind: FaultKind, text: str) -> None:
         super().__init__(text)
         self.kind = kind
 
 
-class Log:
-    """What one call of a function on ``count`` responses passes to log_extra and log_metric."""
+@dataclass(eq=False)
+class Outcome:
+    """What one function gave for a batch: ``scores`` [B] float64, NaN where it gave none; why it failed
+    (``faults``, one per kind, and the ``error`` that was raised); and what it logged.
+    """
 
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self.extras: dict[str, list[Any]] = {}
+    scores: np.ndarray
+    faults: list[Fault] = field(default_factory=list)
+    error: BaseException | None = None
+    metrics: dict[str, float] = field(default_factory=dict)
+    extras: dict[str, list[Any]] = field(default_factory=dict)
+
+
+class JobThread:
+    """A daemon thread that runs one piece of work after the other; it starts with the first one."""
+
+    def __init__(self, name: str, at_end: Callable[[], None] = lambda: None) -> None:
+        self._name, self._at_end = name, at_end
+        self._jobs: queue.SimpleQueue[Any] | None = None
+
+    def run(self, work: Callable[[], None], timeout: float | None) -> None:
+        """Wait until ``work()`` is done, at most ``timeout`` seconds, earlier work included.
+
+        Work that has not begun by then never begins. Raises what ``work`` raises.
+        """
+        if self._jobs is None:
+            self._jobs = queue.SimpleQueue()
+            arguments = (self._jobs, self._at_end)
+            threading.Thread(target=_serve, args=arguments, name=self._name, daemon=True).start()
+            weakref.finalize(self, self._jobs.put, None)
+        future: Future[None] = Future()
+        self._jobs.put((future, work))
+        _, late = wait([future], timeout)
+        if not late or not (future.cancel() or future.running()):
+            future.result()
+
+
+def _serve(jobs: queue.SimpleQueue[Any], at_end: Callable[[], None]) -> None:
+    while (job := jobs.get()) is not None:
+        future, work = job
+        if future.set_running_or_notify_cancel():
+            try:
+                future.set_result(work())
+            except BaseException as error:  # the caller gets it
+                future.set_exception(error)
+        del job, future, work  # a waiting thread must not keep a batch in memory
+    at_end()
+
+
+class Caller:
+    """Calls several functions for the same batch, each within ``timeout`` seconds (None: no limit)."""
+
+    def __init__(
+        self, functions: Sequence[RewardFunction], names: Sequence[str], timeout: float | None
+    ) -> None:
+        self.functions, self.names, self.timeout = functions, names, timeout
+        self._workers = [JobThread(f"reward {name}") for name in names]
+        # one event loop for all batches: a client that user code keeps belongs to the loop it was made in
+        self._loop = asyncio.Runner()
+        self._loop_worker = JobThread("async rewards", self._loop.close)
+
+    def outcomes(
+        self, offered: dict[str, Any], completions: Sequence[Text], weights: Sequence[float]
+    ) -> list[Outcome]:
+        """Call the plain functions in order, then the async ones together.
+
+        ``offered``: the arguments that a function may take; each gets copies. RewardError for a function that
+        wants another one. A score counts when it is finite, as is its product with the function's weight.
+        """
+        pairs = zip(self.names, self.functions, strict=True)
+        calls = [_Call(name, function, offered, len(completions)) for name, function in pairs]
+        together = []
+        for call, worker in zip(calls, self._workers, strict=True):
+            if is_async(call.function):
+                together.append(call)
+            elif self.timeout is None:
+                call.run()
+            else:
+                worker.run(call.run, self.timeout)
+        if together:
+            self._loop_worker.run(lambda: self._loop.run(_all(together, self.timeout)), self.timeout)
+        return [
+            call.outcome(weight, completions, self.timeout)
+            for call, weight in zip(calls, weights, strict=True)
+        ]
+
+
+class _Call:
+    """One function, called for one batch of ``count`` responses."""
+
+    def __init__(self, name: str, function: RewardFunction, offered: dict[str, Any], count: int) -> None:
+        self.name, self.function, self._count = name, function, count
+        self._extras: dict[str, list[Any]] = {}
         self._metrics: dict[str, list[float]] = {}
+        self._back: list[Any] | BaseException | None = None  # what came back: None, as long as nothing has
+        self.late = False
+        copies = {key: _copied(value) for key, value in offered.items()}
+        copies |= {"log_extra": self._log_extra, "log_metric": self._log_metric}
+        self._arguments = _accepted(name, function, copies)
 
-    def extra(self, column: str, values: Sequence[Any]) -> None:
+    def _log_extra(self, column: str, values: Sequence[Any]) -> None:
         """Add a column to the samples. ValueError unless there is one entry per response."""
         values = list(values)
         if len(values) != self._count:
             raise ValueError(
                 f"log_extra({column!r}) got {len(values)} entries, expected {self._count}, one per response."
             )
-        self.extras[str(column)] = values
+        self._extras[str(column)] = values
 
-    def metric(self, name: str, value: float) -> None:
+    def _log_metric(self, name: str, value: float) -> None:
         """Add one value of a metric; values of one name are averaged. TypeError unless it is a number."""
         found = as_number(value)
         if found is None:
             raise TypeError(f"log_metric({name!r}) got None, expected a number.")
         self._metrics.setdefault(str(name), []).append(found)
 
-    def means(self) -> dict[str, float]:
-        """The mean of each metric."""
-        return {name: math.fsum(values) / len(values) for name, values in self._metrics.items()}
-
-
-@dataclass(frozen=True)
-class Result:
-    """What came back in time: ``values``, one entry per response, or the ``error`` that was raised."""
-
-    values: list[Any] | None = None
-    error: BaseException | None = None
-
-
-class Call:
-    """One function, called for one batch.
-
-    ``offered``: the arguments it may take, of which it gets copies that it may change. RewardError when it
-    wants one that is not offered.
-    """
-
-    def __init__(self, name: str, function: RewardFunction, offered: dict[str, Any], count: int) -> None:
-        self.log, self._function, self._count = Log(count), function, count
-        copies = {key: _copied(value) for key, value in offered.items()}
-        copies |= {"log_extra": self.log.extra, "log_metric": self.log.metric}
-        self._arguments = _accepted(name, function, copies)
-
-    def run(self) -> Result:
-        """Call a plain function, whatever it does; reading its values is part of the call."""
+    def run(self) -> None:
+        """Call a plain function and keep what it returns or raises; its values are read in the call too."""
         try:
-            return Result(values=_as_list(self._function(**self._arguments), self._count))
-        except (Exception, SystemExit) as error:  # user code: what it raises is reported by the caller
-            return Result(error=error)
+            self._keep(_as_list(self.function(**self._arguments), self._count))
+        except (Exception, SystemExit) as error:  # user code: what it raises becomes a fault
+            self._keep(error)
 
-    async def run_async(self) -> Result:
+    async def run_async(self) -> None:
         """The same for an async function."""
         try:
-            return Result(values=_as_list(await self._function(**self._arguments), self._count))
+            self._keep(_as_list(await self.function(**self._arguments), self._count))
         except (Exception, SystemExit, asyncio.CancelledError) as error:
-            return Result(error=error)
+            self._keep(error)
+
+    def _keep(self, back: list[Any] | BaseException) -> None:
+        if not self.late:  # a late call may return something when it is cancelled
+            self._back = back
+
+    def outcome(self, weight: float, completions: Sequence[Text], timeout: float | None) -> Outcome:
+        """What came back in time, checked. A score of None is NaN without a fault: the function does not
+        apply. ``weight`` is read only for the size of a score.
+        """
+        back, found = self._back, Outcome(np.full(self._count, np.nan))
+
+        def fault(kind: FaultKind, samples: Iterable[int], text: str) -> None:
+            text = f"Reward function {self.name!r} {text}"
+            found.faults.append(Fault(self.name, kind, tuple(samples), text))
+
+        if back is None:
+            late = f"was not back after {timeout:g} s. Make it faster, or allow it a longer timeout."
+            fault("timeout", range(self._count), late)
+        elif isinstance(back, NoScores):
+            fault(back.kind, range(self._count), str(back))
+        elif isinstance(back, BaseException):
+            fault("exception", range(self._count), f"raised {describe_error(back)}.")
+        if not isinstance(back, list):
+            found.error = back
+            return found
+        for kind, samples in _read_scores(back, weight, found.scores).items():
+            first = back[samples[0]]
+            shown = f"the {type(first).__name__} {str(first)[:60]!r}" if kind == "type" else f"{first}"
+            place = samples_text(samples, completions)
+            fault(kind, samples, f"returned {shown} for {place}, expected a finite number or None.")
+        found.metrics = {
+            f"logged/{name}": math.fsum(values) / len(values) for name, values in self._metrics.items()
+        }
+        found.extras = self._extras
+        return found
+
+
+async def _all(calls: Sequence[_Call], timeout: float | None) -> None:
+    """Run async functions together and cancel those that are late. One that blocks the loop makes all others
+    late too: Python runs them in one thread.
+    """
+    tasks = {asyncio.ensure_future(call.run_async()): call for call in calls}
+    _, late = await asyncio.wait(tasks, timeout=timeout)
+    for task in late:
+        tasks[task].late = True
+        task.cancel()
 
 
 def is_async(function: RewardFunction) -> bool:
@@ -132,7 +243,7 @@ def is_async(function: RewardFunction) -> bool:
 
 
 def as_number(value: Any) -> float | None:
-    """A score as a float, None for None. TypeError for what is no real number.
+    """A score as a float, None for None. TypeError for what is not a real number.
 
     Whole numbers, truth values and scalars of numpy and torch are numbers; text is none, also "0.5".
     """
@@ -141,11 +252,11 @@ def as_number(value: Any) -> float | None:
     if hasattr(value, "item") and getattr(value, "shape", None) == ():
         value = value.item()
     if not isinstance(value, numbers.Real):
-        raise TypeError(f"{value!r} is no number")
+        raise TypeError(f"{value!r} is not a number")
     try:
         return float(value)
     except OverflowError:
-        return math.inf  # too large for a float, of whichever sign: unusable all the same
+        return math.inf  # too large for a float, of either sign: not usable
 
 
 def describe_error(error: BaseException) -> str:
@@ -160,27 +271,15 @@ def describe_error(error: BaseException) -> str:
     return f"{text} (line {line} of {Path(frames[0].filename).name})"
 
 
-def usable_scores(
-    name: str, weight: float, result: Result | None, completions: Sequence[Text], timeout: float | None
-) -> tuple[np.ndarray, list[Fault]]:
-    """The usable scores of one function, [B] float64 with NaN for the others, and the faults, one a kind.
+def samples_text(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:
+    """Samples in words, counted from 0: ``sample 3 of 64 and 5 more (response 'The film ...')``."""
+    shown = repr(str(completions[samples[0]])[:60])
+    more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
+    return f"sample {samples[0]} of {len(completions)}{more} (response {shown})"
 
-    ``result`` None: it was not back in time. A score of None gives NaN without a fault: the function does not
-    apply. ``weight`` is read only for the size of a score.
-    """
-    part, everything = np.full(len(completions), np.nan), tuple(range(len(completions)))
 
-    def fault(kind: FaultKind, samples: Sequence[int], text: str) -> Fault:
-        return Fault(name, kind, tuple(samples), f"Reward function {name!r} {text}")
-
-    if result is None:
-        text = f"was not back after {timeout:g} s. Make it faster, or allow it a longer timeout."
-        return part, [fault("timeout", everything, text)]
-    if isinstance(result.error, NoScores):
-        return part, [fault(result.error.kind, everything, str(result.error))]
-    if result.error is not None:
-        return part, [fault("exception", everything, f"raised {describe_error(result.error)}.")]
-    values = result.values or []
+def _read_scores(values: Sequence[Any], weight: float, scores: np.ndarray) -> dict[FaultKind, list[int]]:
+    """Write the usable values into ``scores``; returns which are not, by the kind of fault."""
     bad: dict[FaultKind, list[int]] = {}
     for sample, value in enumerate(values):
         try:
@@ -191,24 +290,10 @@ def usable_scores(
         if score is None:
             continue
         if abs(weight * score) <= LARGEST:  # False for NaN and infinity, also under the weight 0
-            part[sample] = score
+            scores[sample] = score
         else:
             bad.setdefault("not finite", []).append(sample)
-    faults = []
-    for kind, samples in bad.items():
-        first = values[samples[0]]
-        shown = f"the {type(first).__name__} {str(first)[:60]!r}" if kind == "type" else f"{first}"
-        text = f"returned {shown} for {where(samples, completions)}, expected a finite number or None."
-        faults.append(fault(kind, samples, text))
-    return part, faults
-
-
-def where(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:
-    """``sample 3 of 64 and 5 more (response 'The film ...')``; counted from 0."""
-    text = completions[samples[0]]
-    shown = repr((text if isinstance(text, str) else str(text))[:60])
-    more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
-    return f"sample {samples[0]} of {len(completions)}{more} (response {shown})"
+    return bad
 
 
 def _accepted(name: str, function: RewardFunction, offered: dict[str, Any]) -> dict[str, Any]:
@@ -220,9 +305,8 @@ def _accepted(name: str, function: RewardFunction, offered: dict[str, Any]) -> d
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # some functions written in C have no signature
         return offered
-    for parameter in parameters:
-        if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
-            continue
+    named = [p for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
+    for parameter in named:
         by_position = parameter.kind is parameter.POSITIONAL_ONLY
         if parameter.default is parameter.empty and (by_position or parameter.name not in offered):
             near = difflib.get_close_matches(parameter.name, offered, n=1)
@@ -234,8 +318,7 @@ def _accepted(name: str, function: RewardFunction, offered: dict[str, Any]) -> d
             )
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return offered
-    by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    taken = {parameter.name for parameter in parameters if parameter.kind in by_name}
+    taken = {parameter.name for parameter in named if parameter.kind is not parameter.POSITIONAL_ONLY}
     return {key: value for key, value in offered.items() if key in taken}
 
 
@@ -260,92 +343,7 @@ def _as_list(result: Any, count: int) -> list[Any]:
 
 
 def _copied(value: Any) -> Any:
-    """A list, and the lists and messages directly in it, copied; anything else as it is."""
-    if type(value) is not list:
-        return value
-    return [[_message_copied(part) for part in item] if type(item) is list else item for item in value]
-
-
-def _message_copied(part: Any) -> Any:
-    return dict(part) if type(part) is dict else part
-
-
-class Overdue(TightropeError):
-    """A call was not back at its deadline."""
-
-
-class Worker:
-    """A daemon thread that calls functions one after the other; it begins with the first call."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._jobs: queue.SimpleQueue[Any] | None = None
-
-    def call(self, function: Callable[[], T], timeout: float) -> T:
-        """What ``function()`` returns, or raises. Raises Overdue after ``timeout`` seconds, waiting for an
-        earlier call included; a call that has not begun by then never begins.
-        """
-        if self._jobs is None:
-            self._jobs = queue.SimpleQueue()
-            threading.Thread(target=_work, args=(self._jobs,), name=self._name, daemon=True).start()
-            weakref.finalize(self, self._jobs.put, None)
-        future: Future[T] = Future()
-        self._jobs.put((future, function))
-        _, late = wait([future], timeout)
-        if late and (future.cancel() or future.running()):
-            raise Overdue
-        return future.result()
-
-
-def _work(jobs: queue.SimpleQueue[Any]) -> None:
-    while True:
-        job = jobs.get()
-        if job is None:
-            return
-        future, function = job
-        if future.set_running_or_notify_cancel():
-            try:
-                future.set_result(function())
-            except BaseException as error:  # whatever it is, the caller gets it
-                future.set_exception(error)
-        del job, future, function  # a waiting thread must not keep a batch in memory
-
-
-class EventLoop:
-    """An event loop in a daemon thread, the same one for every call; it begins with the first call.
-
-    The loop lives on between calls, because clients that user code keeps (HTTP sessions) belong to the loop
-    they were made in. It also works where the caller is inside an event loop already, as in a notebook.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._loop: asyncio.AbstractEventLoop | None = None
-
-    def call(
-        self, functions: Sequence[Callable[[], Coroutine[Any, Any, T]]], timeout: float | None
-    ) -> list[T | None]:
-        """What the coroutines of all functions return, run together; None for each that is not back in time.
-
-        A late one is cancelled. One that blocks the loop makes all the others late, too: Python runs them in
-        one thread. Raises what a coroutine raises.
-        """
-        if self._loop is None:
-            self._loop = asyncio.new_event_loop()
-            threading.Thread(target=_run_event_loop, args=(self._loop,), name=self._name, daemon=True).start()
-            weakref.finalize(self, self._loop.call_soon_threadsafe, self._loop.stop)
-        futures = [asyncio.run_coroutine_threadsafe(function(), self._loop) for function in functions]
-        wait(futures, timeout)
-        return [None if future.cancel() else future.result() for future in futures]
-
-
-def _run_event_loop(loop: asyncio.AbstractEventLoop) -> None:
-    asyncio.set_event_loop(loop)
-    loop.run_forever()
-    left = asyncio.all_tasks(loop)
-    for task in left:
-        task.cancel()
-    if left:
-        loop.run_until_complete(asyncio.wait(left, timeout=1.0))
-    loop.run_until_complete(loop.shutdown_asyncgens())
-    loop.close()
+    """Lists and the messages in them, copied; anything else as it is."""
+    if type(value) is list:
+        return [_copied(item) for item in value]
+    return dict(value) if type(value) is dict else value

@@ -2,14 +2,14 @@
 
     def reward(prompts, completions, completion_ids, **columns) -> list[float | None]
 
-A function may be plain or ``async``; all arguments are passed by keyword. What it may not do is spoil a run:
-one that hangs, raises, or returns NaN or the wrong number of scores ends in a `RewardError` that names it, or
-in samples that are masked and counted, never in a wrong number.
+A function may be plain or ``async``; all arguments are passed by keyword. It cannot spoil a run:
+when it hangs, raises, or returns NaN or the wrong number of scores, the result is a `RewardError` that names
+it, or samples that are masked and counted, never a wrong number.
 """
 
 from __future__ import annotations
 
-import contextlib
+import dataclasses
 import importlib.util
 import inspect
 import itertools
@@ -25,21 +25,16 @@ from typing import Any, Literal
 import numpy as np
 
 from tightrope.language.reward.call import (
-    Call,
-    EventLoop,
+    Caller,
     Fault,
     FaultKind,
-    Overdue,
-    Result,
+    Outcome,
     RewardError,
     RewardFunction,
     Text,
-    Worker,
     as_number,
     describe_error,
-    is_async,
-    usable_scores,
-    where,
+    samples_text,
 )
 
 # What is a mistake in the code raises by default; what the data or the world does masks the samples.
@@ -58,7 +53,7 @@ class Scores:
     NaN where it does not apply or failed. ``metrics``, under declared names: the mean of each part
     (``scores/NAME``), what log_metric got (``logged/NAME``), and how many samples a function failed to score
     (``rewards/NAME/errors``, ``rewards/NAME/timeouts``; absent: none). ``extras``:
-    columns of B entries from log_extra. ``faults``: why samples are masked, one a function and kind.
+    columns of B entries from log_extra. ``faults``: why samples are masked, one per function and kind.
     """
 
     total: np.ndarray
@@ -73,13 +68,14 @@ class Rewards:
     """Several reward functions with weights, as one.
 
     ``functions``: callables or (callable, weight) pairs. ``names``: one each; by default the functions' own.
-    ``timeout``: seconds a function may take for a batch. One that takes longer is left behind in a thread
+    ``timeout``: seconds a function may take for a batch. One that takes longer is left in a thread
     (Python cannot kill one) and its samples are masked. None: no limit, and plain functions run in the
     caller's thread. ``on_error``: "mask" masks and counts the samples of every fault, "raise" raises
     RewardError for every fault; None raises for mistakes in the code (exceptions, wrong length, wrong type)
-    and masks for what data and world do (NaN, infinity, timeouts). None among the scores is no fault: the
-    function does not apply to that sample. A sample that no function applies to is always masked. ``alone``
-    False: something else scores the responses too, and batches to which no function applies are no error.
+    and masks for what the data or the outside world does (NaN, infinity, timeouts). A score of None is no
+    fault: the function does not apply to that sample. A sample that no function applies to is always masked.
+    ``alone`` False: something else scores the responses too, and batches to which no function applies are no
+    error.
 
     Raises ValueError for no function, something that cannot be called, a weight that is not finite, names
     that do not fit.
@@ -94,16 +90,20 @@ class Rewards:
         alone: bool = True,
     ) -> None:
         pairs = [item if isinstance(item, tuple) else (item, 1.0) for item in functions]
-        self.functions = [_checked_function(function) for function, _ in pairs]
+        for function, _ in pairs:
+            if not callable(function):
+                raise ValueError(
+                    f"A reward function is the {type(function).__name__} {function!r}, expected a callable."
+                )
+        self.functions = [function for function, _ in pairs]
         self.weights = [checked_weight(weight) for _, weight in pairs]
         self.names = _checked_names(self.functions, names)
         if timeout is not None and not 0 < timeout < math.inf:
             raise ValueError(f"timeout is {timeout}, expected seconds above 0, or None for no limit.")
         if on_error not in (None, "mask", "raise"):
             raise ValueError(f"on_error is {on_error!r}, expected 'mask', 'raise' or None.")
-        self.timeout, self.on_error, self.alone = timeout, on_error, alone
-        self._workers = [Worker(f"reward {name}") for name in self.names]
-        self._loop = EventLoop("async rewards")
+        self.on_error, self.alone = on_error, alone
+        self._caller = Caller(self.functions, self.names, timeout)
         self._empty_batches = 0
 
     def score(
@@ -122,9 +122,12 @@ class Rewards:
         an argument.
         """
         columns = {name: list(v) for name, v in (columns or {}).items() if name not in NOT_COLUMNS}
-        _check_lengths(
-            {"completions": completions, "completion_ids": completion_ids, **columns}, len(prompts)
-        )
+        lists = {"completions": completions, "completion_ids": completion_ids, **columns}
+        for name, values in lists.items():
+            if len(values) != len(prompts):
+                raise ValueError(
+                    f"{name} has {len(values)} entries, expected {len(prompts)}, one per prompt."
+                )
         taken = [name for name in columns if name in ARGUMENTS]
         if taken:
             raise ValueError(
@@ -137,68 +140,39 @@ class Rewards:
             "trainer_state": trainer_state,
             **columns,
         }
-        calls = [
-            Call(name, function, offered, len(prompts))
-            for name, function in zip(self.names, self.functions, strict=True)
-        ]
-        results = self._results(calls) if len(prompts) else []
-        scores = self._joined(calls, results, completions)
+        outcomes = self._caller.outcomes(offered, completions, self.weights) if len(prompts) else []
+        scores = self._joined(outcomes, completions)
         self._refuse_to_learn_nothing(scores)
         return scores
 
-    def _results(self, calls: list[Call]) -> list[Result | None]:
-        """Every function's result, None for a late one: plain ones in order, then async ones together."""
-        results: list[Result | None] = [None] * len(calls)
-        later = []
-        for index, call in enumerate(calls):
-            if is_async(self.functions[index]):
-                later.append(index)
-            elif self.timeout is None:
-                results[index] = call.run()
-            else:
-                with contextlib.suppress(Overdue):
-                    results[index] = self._workers[index].call(call.run, self.timeout)
-        if later:
-            found = self._loop.call([calls[index].run_async for index in later], self.timeout)
-            for index, result in zip(later, found, strict=True):
-                results[index] = result
-        return results
-
-    def _joined(self, calls: list[Call], results: list[Result | None], completions: Sequence[Text]) -> Scores:
+    def _joined(self, outcomes: list[Outcome], completions: Sequence[Text]) -> Scores:
         """All functions' scores, weighted and added up. RewardError for a fault that the settings raise."""
         count = len(completions)
         total, applies, broken = np.zeros(count), np.zeros(count, bool), np.zeros(count, bool)
-        parts = {name: np.full(count, np.nan) for name in self.names}
-        metrics: dict[str, float] = {}
-        extras: dict[str, list[Any]] = {}
-        faults: list[Fault] = []
-        for name, weight, call, result in zip(self.names, self.weights, calls, results, strict=False):
-            part, found = usable_scores(name, weight, result, completions, self.timeout)
-            for fault in found:
+        found = Scores(total, applies, {name: np.full(count, np.nan) for name in self.names}, {}, {})
+        for name, weight, outcome in zip(self.names, self.weights, outcomes, strict=False):
+            for fault in outcome.faults:
                 if self.on_error == "raise" or (self.on_error is None and fault.kind in RAISES):
-                    raise RewardError(fault.text) from (None if result is None else result.error)
+                    raise RewardError(fault.text) from outcome.error
                 broken[list(fault.samples)] = True
                 counter = f"rewards/{name}/{'timeouts' if fault.kind == 'timeout' else 'errors'}"
-                metrics[counter] = metrics.get(counter, 0.0) + len(fault.samples)
-            faults += found
-            scored = ~np.isnan(part)
-            total[scored] += weight * part[scored]
+                found.metrics[counter] = found.metrics.get(counter, 0.0) + len(fault.samples)
+            found.faults.extend(outcome.faults)
+            scored = ~np.isnan(outcome.scores)
+            total[scored] += weight * outcome.scores[scored]
             applies |= scored
-            parts[name] = part
+            found.parts[name] = outcome.scores
             if scored.any():
-                metrics[f"scores/{name}"] = float(part[scored].mean())
-            if result is not None and result.error is None:
-                metrics |= {f"logged/{key}": value for key, value in call.log.means().items()}
-                extras |= {
-                    f"{column} ({name})" if column in extras else column: entries
-                    for column, entries in call.log.extras.items()
-                }
+                found.metrics[f"scores/{name}"] = float(outcome.scores[scored].mean())
+            found.metrics.update(outcome.metrics)
+            for column, entries in outcome.extras.items():
+                found.extras[f"{column} ({name})" if column in found.extras else column] = entries
         nobody = np.flatnonzero(~applies & ~broken)
         if len(nobody):
-            text = f"No reward function applies to {where(nobody, completions)}: all returned None."
-            faults.append(Fault("", "none", tuple(nobody.tolist()), text))
+            text = f"No reward function applies to {samples_text(nobody, completions)}: all returned None."
+            found.faults.append(Fault("", "none", tuple(nobody.tolist()), text))
         valid = applies & ~broken
-        return Scores(np.where(valid, total, np.nan), valid, parts, metrics, extras, faults)
+        return dataclasses.replace(found, total=np.where(valid, total, np.nan), valid=valid)
 
     def _refuse_to_learn_nothing(self, scores: Scores) -> None:
         lost = self.alone or any(fault.kind != "none" for fault in scores.faults)
@@ -213,22 +187,8 @@ class Rewards:
             )
 
 
-def _check_lengths(lists: dict[str, Sequence[Any]], count: int) -> None:
-    for name, values in lists.items():
-        if len(values) != count:
-            raise ValueError(f"{name} has {len(values)} entries, expected {count}, one per prompt.")
-
-
-def _checked_function(function: Any) -> RewardFunction:
-    if not callable(function):
-        raise ValueError(
-            f"A reward function is the {type(function).__name__} {function!r}, expected a callable."
-        )
-    return function
-
-
 def checked_weight(weight: Any) -> float:
-    """The weight as a float. ValueError for what is no finite number."""
+    """The weight as a float. ValueError for what is not a finite number."""
     value = None if isinstance(weight, str) else as_number(weight)
     if value is None or not math.isfinite(value):
         raise ValueError(f"The weight of a reward function is {weight!r}, expected a finite number.")
@@ -282,7 +242,7 @@ def load_reward_function(word: str) -> RewardFunction:
     spec = importlib.util.spec_from_file_location(f"reward_file_{path.stem}", path.resolve())
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(path.resolve().parent))  # what lies beside the file can be imported, also later
+    sys.path.insert(0, str(path.resolve().parent))  # files beside it can be imported, also later
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)

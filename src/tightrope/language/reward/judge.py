@@ -1,12 +1,10 @@
-"""Who judges responses: a reward model on the policy's own trunk, one with a trunk of its own, or
-functions.
-"""
+"""The judge of responses: a reward model on the policy's trunk, one with a trunk of its own, or functions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +14,7 @@ from tightrope.algorithms.memory import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions
 from tightrope.language.model import lora
-from tightrope.language.model.load import fingerprint, read_metadata, read_tensors
+from tightrope.language.model.load import read_metadata, read_tensors, weights_fingerprint
 from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.call import Fault, RewardError
@@ -49,7 +47,7 @@ class Judge:
         self.weight = weight
 
     def __call__(self, prompts: Sequence[Prompt], answers: Completions, trainer_state: Any = None) -> Scores:
-        """Scores of the responses to ``prompts``, one prompt a response."""
+        """Scores of the responses to ``prompts``, one prompt per response."""
         found = self._of_functions(prompts, answers, trainer_state)
         try:
             learnt = self._of_model(answers)
@@ -68,15 +66,14 @@ class Judge:
     def _of_functions(self, prompts: Sequence[Prompt], answers: Completions, state: Any) -> Scores | None:
         if self.functions is None:
             return None
-        ids = answers.ids()
-        texts = [self.roles.tokenizer.decode(row, skip_special_tokens=True) for row in ids]
+        texts = [self.roles.tokenizer.decode(row, skip_special_tokens=True) for row in answers.ids]
         completions = [
             text if isinstance(prompt.shown, str) else [{"role": "assistant", "content": text}]
             for prompt, text in zip(prompts, texts, strict=True)
         ]
         names = {name for prompt in prompts for name in prompt.columns}
         columns = {name: [prompt.columns.get(name) for prompt in prompts] for name in sorted(names)}
-        return self.functions.score([p.shown for p in prompts], completions, ids, columns, state)
+        return self.functions.score([p.shown for p in prompts], completions, answers.ids, columns, state)
 
     @torch.no_grad()
     def _of_model(self, answers: Completions) -> np.ndarray | None:
@@ -132,24 +129,40 @@ def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) ->
     )
 
 
-def is_folder(reward: Any) -> bool:
-    """Whether a reward, or one of several, is the folder of a reward model."""
-    entries = (_weighted(entry)[0] for entry in _entries(reward))
-    return any(isinstance(entry, str | Path) and Path(entry).is_dir() for entry in entries)
+class GivenReward(NamedTuple):
+    """One of the rewards that were given, its weight, and its folder where it is a reward model."""
+
+    given: Any
+    weight: float
+    folder: Path | None
 
 
-def reward_adapter(words: Any) -> Path | None:
+def _entries(reward: Any) -> list[GivenReward]:
+    """The rewards that were given: one, or a list. ValueError for a weight that is not a finite number."""
+    found = []
+    for given in reward if isinstance(reward, list) else [reward]:
+        pair = isinstance(given, tuple) and len(given) == 2
+        word, weight = (given[0], checked_weight(given[1])) if pair else (given, 1.0)
+        folder = Path(word) if isinstance(word, str | Path) and Path(word).is_dir() else None
+        found.append(GivenReward(word, weight, folder))
+    return found
+
+
+def folder_of(reward: Any) -> Path | None:
+    """The folder of a reward model, where a reward, or one of several, is one."""
+    return next((entry.folder for entry in _entries(reward) if entry.folder is not None), None)
+
+
+def reward_adapter(reward: Any) -> Path | None:
     """The adapter folder of a reward model that was trained with LoRA, None for any other reward."""
-    for entry, _ in map(_weighted, _entries(words)):
-        if isinstance(entry, str | Path) and (Path(entry) / "adapter" / "head.safetensors").is_file():
-            return Path(entry) / "adapter"
-    return None
+    folders = [entry.folder / "adapter" for entry in _entries(reward) if entry.folder is not None]
+    return next((folder for folder in folders if (folder / "head.safetensors").is_file()), None)
 
 
 def shares_trunk(adapter: Path, model: str) -> bool:
-    """Whether a reward adapter was trained on the very weights that are aligned, wherever they lie."""
+    """Whether a reward adapter was trained on the same weights that are aligned, in any folder."""
     trained = read_metadata(adapter / "head.safetensors").get("trunk")
-    return bool(trained) and trained == fingerprint(model)
+    return bool(trained) and trained == weights_fingerprint(model)
 
 
 def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: float | None) -> Judge:
@@ -163,35 +176,28 @@ def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: flo
         raise ValueError(
             "There is no reward. Give a function, 'length', FILE.py:function or the folder of a reward model."
         )
-    for entry, weight in map(_weighted, _entries(reward)):
-        if is_folder(entry):
+    for entry in _entries(reward):
+        if entry.folder is not None:
             if model is not None or adapter is not None:
                 raise ValueError("Two reward models were given; expected one, and any number of functions.")
-            model_weight = weight
-            if on_trunk is not None and reward_adapter(entry) == on_trunk:
+            model_weight = entry.weight
+            if on_trunk is not None and entry.folder / "adapter" == on_trunk:
                 adapter = read_head(on_trunk, roles)
             else:
-                model = load_reward(Path(entry)).to(roles.settings.device)
-                _same_tokens(model, roles, entry)
-        elif isinstance(entry, str):
-            functions.append((load_reward_function(entry), weight))
-        elif callable(entry):
-            functions.append((entry, weight))
+                model = load_reward(entry.folder).to(roles.settings.device)
+                _same_tokens(model, roles, entry.folder)
+        elif isinstance(entry.given, str):
+            functions.append((load_reward_function(entry.given), entry.weight))
+        elif callable(entry.given):
+            functions.append((entry.given, entry.weight))
         else:
             raise ValueError(
-                f"reward is {entry!r}; expected a function, 'length', FILE.py:function, the folder of a "
-                "reward model, one of these with its weight in a pair, or a list of them."
+                f"reward is {entry.given!r}; expected a function, 'length', FILE.py:function, the folder of "
+                "a reward model, one of these with its weight in a pair, or a list of them."
             )
     alone = model is None and adapter is None
     rewards = Rewards(functions, timeout=timeout, alone=alone) if functions else None
     return Judge(roles, rewards, model, adapter, model_weight)
-
-
-def _weighted(entry: Any) -> tuple[Any, float]:
-    """A reward and its weight, 1 where none is given. ValueError for a weight that is no finite number."""
-    if isinstance(entry, tuple) and len(entry) == 2:
-        return entry[0], checked_weight(entry[1])
-    return entry, 1.0
 
 
 def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:
@@ -221,15 +227,15 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
     """Begin the critic with a reward model's weights: V = what its score adds to the reward at first.
 
     An adapter takes the reward model's adapter, a critic of its own the whole reward model; a head on the
-    policy's hidden states cannot read what the reward model's hidden states say. ValueError for what does not
+    policy's hidden states cannot read those of the reward model. ValueError for what does not
     fit.
     """
-    folder = next((_weighted(entry)[0] for entry in _entries(reward) if is_folder(entry)), None)
+    folder = folder_of(reward)
     kind, head = roles.settings.critic, roles.critic_head
     if folder is None or head is None or kind == "head" or (kind == "adapter" and judge.adapter is None):
         raise ValueError(
             f"critic_from_reward with critic {kind!r}: expected the folder of a reward model as reward and "
-            "critic separate, or critic adapter with a reward adapter on the very model that is aligned "
+            "critic separate, or critic adapter with a reward adapter on the same model that is aligned "
             "(tightrope reward --tune lora). Choose one, or leave critic_from_reward out."
         )
     if kind == "adapter" and judge.adapter is not None:
@@ -244,14 +250,10 @@ def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
             roles.critic.trunk.parts.base.load_state_dict(model.base.state_dict())
         except RuntimeError as error:
             raise ValueError(
-                f"critic_from_reward: the reward model {folder} is built otherwise than the critic, which is "
-                f"made of {roles.settings.model} ({str(error).splitlines()[-1].strip()}). Leave it out."
+                f"critic_from_reward: the reward model {folder} is built differently from the critic, which "
+                f"is made of {roles.settings.model} ({str(error).splitlines()[-1].strip()}). Leave it out."
             ) from error
     scale = judge.weight * roles.settings.reward_scale
     with torch.no_grad():
         head.weight.copy_(weight * scale)
         head.bias.fill_(-shift * scale)
-
-
-def _entries(reward: Any) -> list[Any]:
-    return list(reward) if isinstance(reward, list) else [reward]

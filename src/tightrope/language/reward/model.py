@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
 from tightrope.language.model.load import fused, load_tokenizer, pretrained, read_object, without_dropout
-from tightrope.language.quiet import quiet
+from tightrope.language.quiet import quiet_libraries
 
 SHIFT = "tightrope_reward_shift"  # in config.json: score = output of the head - shift
 
@@ -51,7 +51,7 @@ class RewardModel:
         return self.raw(tokens, real) - self.shift
 
 
-@quiet()
+@quiet_libraries()
 def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> RewardModel:
     """A reward model from a run folder of ``tightrope reward``, or from any folder that
     AutoModelForSequenceClassification loads with one label and a head called ``score``.
@@ -64,7 +64,7 @@ def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> Rewar
     path = path / "model" if (path / "model" / "config.json").is_file() else path
     if not (path / "config.json").is_file():
         raise ValueError(
-            f"{folder} is no reward model: it holds no config.json. Train one: tightrope reward."
+            f"{folder} is not a reward model: it holds no config.json. Train one: tightrope reward."
         )
     kinds = read_object(path / "config.json").get("architectures") or ["nothing named"]
     if not kinds[0].endswith("ForSequenceClassification"):  # loading would make up a head

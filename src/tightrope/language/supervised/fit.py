@@ -17,9 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tightrope.algorithms.memory import Parts
+from tightrope.algorithms.descent import CheckedSteps
+from tightrope.algorithms.memory import MicroBatches
 from tightrope.algorithms.nonfinite import explain_loss
-from tightrope.algorithms.optimise import Adam, Meter, StepGuard
+from tightrope.algorithms.optimise import Adam
 from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.checkpoint import understood
@@ -33,7 +34,7 @@ from tightrope.training.parameters import Tensors, restore_tensors, tensors_of
 
 @dataclass(frozen=True)
 class Objective:
-    """What is learnt from ``items``.
+    """What is learnt from ``items``: ``parameters`` are trained, ``data`` describes the items in words.
 
     ``loss(items)`` is the loss summed over their terms, and sums of further figures by name; ``count(item)``
     its number of terms, ``length(item)`` its tokens. Metrics are named ``name/...``, those of the optimiser
@@ -50,6 +51,8 @@ class Objective:
     evaluate: Callable[[], dict[str, float]]
     save: Callable[[Path, dict[str, float]], dict[str, Any]] = lambda folder, newest: {}
     seen: str | None = None
+    parameters: Sequence[nn.Parameter] = ()
+    data: str = ""
 
 
 class SupervisedLearner:
@@ -60,15 +63,14 @@ class SupervisedLearner:
     def __init__(
         self,
         objective: Objective,
-        parameters: Sequence[nn.Parameter],
         settings: SupervisedSettings,
         lines: Sequence[str] = (),
     ) -> None:
         self.objective = objective
-        self.parameters = parameters
+        self.parameters = objective.parameters
         self.settings = settings
         self.lines = list(lines)
-        group = {"params": list(parameters), "lr": settings.learning_rate}
+        group = {"params": list(objective.parameters), "lr": settings.learning_rate}
         self.optimiser = Adam([group], eps=1e-8, fused=True)
         self.steps_per_epoch = math.ceil(len(objective.items) / settings.minibatch_size)
         self.step = 0
@@ -110,14 +112,14 @@ class SupervisedLearner:
         Raises NonFiniteError before a step with a NaN or an infinity in its gradient.
         """
         objective, total = self.objective, self.total
-        guard = StepGuard(self.parameters[0].device)
+        checked = CheckedSteps(self.parameters[0].device)
         batches = minibatches(objective.items, self.settings, self.rollbacks)
         for minibatch in islice(batches, self.step, None):
             now = dataclasses.replace(self.settings, **self.changes)
             rate = scheduled(now.learning_rate, now.learning_rate_schedule, self.step / total)
             self.optimiser.param_groups[0]["lr"] = rate
-            memory = Parts(self.micro_batch_size)
-            metrics = take_step(objective, minibatch, self.optimiser, guard, now, memory)
+            memory = MicroBatches(self.micro_batch_size)
+            metrics = take_step(objective, minibatch, self.optimiser, checked, now, memory)
             metrics |= {f"{objective.steps}/learning_rate": rate or 0.0, **memory.metrics()}
             self.step += 1
             self.micro_batch_size = memory.size
@@ -174,7 +176,7 @@ class SupervisedLearner:
         if before != items:
             raise ValueError(
                 f"{folder.parent.parent} was learning from {before} examples, the data now have {items}. "
-                "Give the data that the run began with, or begin a new run."
+                "Give the data that the run started with, or start a new run."
             )
 
     def roll_back(self, point: Checkpoint) -> None:
@@ -200,8 +202,8 @@ class SupervisedLearner:
 def minibatches(
     items: Sequence[Item], settings: SupervisedSettings, rollbacks: int = 0
 ) -> Iterator[list[Item]]:
-    """Those of every step, in order: a function of the seed and the number of rollbacks only, wherever a run
-    is stopped. In the epoch of a rollback some examples come twice and others not at all.
+    """Those of every step, in order: a function of only the seed and the number of rollbacks, also after a
+    resume. In the epoch of a rollback some examples come twice and others not at all.
     """
     rng = np.random.default_rng([settings.seed, rollbacks] if rollbacks else settings.seed)
     size = settings.minibatch_size
@@ -215,15 +217,14 @@ def take_step(
     objective: Objective,
     minibatch: Sequence[Any],
     optimiser: torch.optim.Optimizer,
-    guard: StepGuard,
+    checked: CheckedSteps,
     settings: SupervisedSettings,
-    parts: Parts | None = None,
+    parts: MicroBatches | None = None,
 ) -> dict[str, float]:
     """One optimiser step on the mean over all terms of the minibatch, however it is split; ``parts`` knows
     from the steps before what fits into memory.
     """
-    parts = parts or Parts(settings.micro_batch_size)
-    meter = Meter()
+    parts = parts or MicroBatches(settings.micro_batch_size)
     count = sum(objective.count(item) for item in minibatch)
 
     def gradient(size: int | None) -> dict[str, Tensor]:
@@ -236,12 +237,11 @@ def take_step(
                 sums[name] = sums[name] + x if name in sums else x
         return sums
 
-    sums = parts.fitting(len(minibatch), gradient, optimiser)
-    guard.refuse(~torch.isfinite(sums["loss"]))
-    guard.step(optimiser, settings.max_grad_norm, meter)
-    guard.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
+    sums = parts.compute(len(minibatch), gradient, optimiser)
+    norm = checked.take(optimiser, settings.max_grad_norm, sums["loss"])
+    checked.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
     metrics = {f"{objective.name}/{name}": float(x) / count for name, x in sums.items()}
-    metrics[f"{objective.steps}/grad_norm"] = meter.means()["train/grad_norm"]
+    metrics[f"{objective.steps}/grad_norm"] = float(norm)
     return metrics
 
 

@@ -3,7 +3,7 @@
     L = -log sigmoid(r(chosen) - r(rejected)),  r(text) = w . h(last real token)      (Bradley, Terry 1952)
 
 A trained score is put to mean 0 and deviation 1 on demonstrations: r = w' . h - shift. w' = w / deviation is
-saved as the head, and shift = mean / deviation stands in config.json: the head has no bias to hold it.
+saved as the head, and shift = mean / deviation is stored in config.json, because the head has no bias.
 """
 
 from __future__ import annotations
@@ -18,16 +18,14 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.data.batching import pad_right
-from tightrope.language.data.examples import Pair, hold_out, preference_pairs, read_rows, sft_examples
-from tightrope.language.model import lora
+from tightrope.language.data.examples import Pair, preference_pairs, read_rows, sft_examples
 from tightrope.language.model.parts import parts
-from tightrope.language.quiet import quiet
 from tightrope.language.reward.model import RewardModel
 from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised.fit import Objective, micro_batches
 from tightrope.language.supervised.preferences_saving import reward_skeleton, save_reward
-from tightrope.language.supervised.prepare import Loaded, precision, prepared, training_rows
-from tightrope.language.supervised.run import recorded, reopened, train_supervised
+from tightrope.language.supervised.prepare import Loaded, examples_of, precision
+from tightrope.language.supervised.run import Stage, resume_stage, train_stage
 from tightrope.training.events import Listener, Listeners
 
 DEMONSTRATIONS = 1024  # texts on which scores are normalised, at most
@@ -74,7 +72,7 @@ def calibration(difference: Tensor) -> tuple[float, list[dict[str, float]]]:
     return error, table
 
 
-def differences(model: RewardModel, pairs: Sequence[Pair]) -> Tensor:
+def score_differences(model: RewardModel, pairs: Sequence[Pair]) -> Tensor:
     """r(chosen) - r(rejected) of pairs [B], differentiable; both texts of a pair in one forward pass."""
     texts = [pair.chosen for pair in pairs] + [pair.rejected for pair in pairs]
     tokens, real = (x.to(model.head.weight.device) for x in pad_right(texts))
@@ -91,7 +89,7 @@ def longest(pair: Pair) -> int:
 def normalise(model: RewardModel, texts: Sequence[Sequence[int]], size: int) -> tuple[float, float]:
     """Put the scores to mean 0 and deviation 1 on these texts; returns what mean and deviation were.
 
-    Scores that are all the same keep their scale.
+    Scores that are all equal keep their scale.
     """
     parts_of = micro_batches(texts, size, len)
     batches = [tuple(x.to(model.head.weight.device) for x in pad_right(part)) for part in parts_of]
@@ -103,7 +101,6 @@ def normalise(model: RewardModel, texts: Sequence[Sequence[int]], size: int) -> 
     return mean, deviation
 
 
-@quiet()
 def train_reward(
     settings: RewardSettings,
     *,
@@ -125,13 +122,9 @@ def train_reward(
     is one, for too little memory, before the model is loaded.
     """
     given = {"data": data, "validation": validation, "demonstrations": demonstrations}
-    settings = recorded(settings, **given, model=model and model[0])
-    told = Listeners(listeners)
-    with prepared(settings, "reward", model, told) as loaded:
-        return _train(settings, loaded, given, told, run_dir)
+    return train_stage(REWARD_STAGE, settings, given, model, listeners, run_dir)
 
 
-@quiet()
 def resume_reward(
     run_dir: str | Path,
     *,
@@ -141,32 +134,29 @@ def resume_reward(
     model: tuple[Any, Any] | None = None,
     listeners: Sequence[Listener] = (),
 ) -> dict[str, Any]:
-    """Go on with a run of `train_reward`, as `resume_sft` does with one of `train_sft`."""
+    """Continue a run of `train_reward`, as `resume_sft` does with one of `train_sft`."""
     given = {"data": data, "validation": validation, "demonstrations": demonstrations}
-    run, settings = reopened(RewardSettings, run_dir, **given, model=model and model[0])
-    told = Listeners(listeners)
-    with run, prepared(settings, "reward", model, told) as loaded:
-        return _train(settings, loaded, given, told, run)
+    return resume_stage(REWARD_STAGE, run_dir, given, model, listeners)
 
 
-def _train(
-    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners, place: Any
-) -> dict[str, Any]:
+def _objective(
+    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners
+) -> Objective:
     base, size = parts(loaded.model).base, settings.micro_batch_size or settings.minibatch_size
     head = make_head(loaded.model.config.hidden_size, settings.seed).to(settings.device)
     model, skeleton = RewardModel(base, head, 0.0, loaded.tokenizer), reward_skeleton(loaded)
-    pairs, held, texts = _data(settings, loaded, listeners, **given)
+    pairs, held, texts = _data(settings, loaded, given, listeners)
 
     def loss(items: Sequence[Pair]) -> tuple[Tensor, dict[str, Tensor]]:
         with precision(settings):
-            found = differences(model, items)
+            found = score_differences(model, items)
         seen = found.detach()
         return pair_loss(found), {"accuracy": right_order(seen).sum(), "margin": seen.sum()}
 
     @torch.no_grad()
     def held_out() -> Tensor:
         with precision(settings):
-            return torch.cat([differences(model, part) for part in micro_batches(held, size, longest)])
+            return torch.cat([score_differences(model, part) for part in micro_batches(held, size, longest)])
 
     def evaluate() -> dict[str, float]:
         if not held:
@@ -189,35 +179,30 @@ def _train(
             "demonstrations": len(texts),
         }
 
-    trunk = list(base.parameters())
-    if loaded.adapter is not None:
-        trunk = lora.adapter_parameters(loaded.model, loaded.adapter)
-    parameters = [*trunk, *head.parameters()]
-    objective = Objective("reward", "train", pairs, loss, lambda pair: 1, longest, evaluate, save)
-    words = f"{len(pairs)} pairs; {len(held)} held out"
-    return train_supervised(objective, parameters, settings, loaded, place, listeners, words)
+    return Objective(
+        "reward", "train", pairs, loss, lambda pair: 1, longest, evaluate, save,
+        parameters=[*loaded.trained(base), *head.parameters()],
+        data=f"{len(pairs)} pairs; {len(held)} held out",
+    )  # fmt: skip
+
+
+REWARD_STAGE = Stage("reward", RewardSettings, _objective)
 
 
 def _data(
-    settings: RewardSettings,
-    loaded: Loaded,
-    listeners: Listeners,
-    data: Any,
-    validation: Any,
-    demonstrations: Any,
+    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners
 ) -> tuple[list[Pair], list[Pair], list[tuple[int, ...]]]:
     """Pairs to train on, pairs held out (whole prompts, where there are many), and texts to normalise on."""
     reading: dict[str, Any] = {"eos": loaded.eos, "max_tokens": settings.max_tokens, "notify": listeners.warn}
-    pairs = preference_pairs(training_rows(settings, data), loaded.tokenizer, **reading)
-    held: list[Pair] = []
-    if (source := settings.validation if validation is None else validation) is not None:
-        held = preference_pairs(read_rows(source), loaded.tokenizer, **reading)
-    else:
-        pairs, held = hold_out(
-            pairs, settings.held_out, settings.seed, lambda pair: pair.chosen[: pair.prompt_length]
-        )
+    pairs, held = examples_of(
+        settings,
+        given,
+        lambda rows: preference_pairs(rows, loaded.tokenizer, **reading),
+        lambda pair: pair.chosen[: pair.prompt_length],
+    )
     texts = [pair.chosen for pair in pairs]
-    if (source := settings.demonstrations if demonstrations is None else demonstrations) is not None:
+    source = settings.demonstrations if given["demonstrations"] is None else given["demonstrations"]
+    if source is not None:
         texts = [example.tokens for example in sft_examples(read_rows(source), loaded.tokenizer, **reading)]
     order = np.random.default_rng([settings.seed, 2]).permutation(len(texts))[:DEMONSTRATIONS]
     return pairs, held, [texts[i] for i in order]

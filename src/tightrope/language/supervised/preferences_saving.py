@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.model import lora
-from tightrope.language.model.load import fingerprint, without_weights
+from tightrope.language.model.load import weights_fingerprint, without_weights
 from tightrope.language.model.saving import save_adapter
 from tightrope.language.reward.model import SHIFT
 from tightrope.language.supervised.prepare import Loaded
@@ -19,7 +18,7 @@ from tightrope.runs.durable import atomic_folder
 
 
 def reward_skeleton(loaded: Loaded) -> Any:
-    """The model class that scores with this trunk, without weights: it tells early whether there is one."""
+    """The model class that scores with this trunk, without weights; made early, to learn if there is one."""
     from transformers import AutoModelForSequenceClassification
 
     config = copy.deepcopy(loaded.model.config)
@@ -33,7 +32,7 @@ def reward_skeleton(loaded: Loaded) -> Any:
     if not isinstance(getattr(skeleton, "score", None), nn.Linear) or skeleton.score.bias is not None:
         raise ValueError(
             f"{type(skeleton).__name__} has no bias-free head called score, so that a reward model of it "
-            "would not load elsewhere. Llama, Qwen, Mistral, GPT-2 and their kin have."
+            "would not load elsewhere. Llama, Qwen, Mistral, GPT-2 and similar models have one."
         )
     return skeleton
 
@@ -45,7 +44,9 @@ def save_reward(
 
     ``head`` [1, d] with the gain folded in; ``shift`` is what has to be subtracted from its scores.
     """
-    prefix, head = f"{loaded.model.base_model_prefix}.", head.detach()
+    from safetensors.torch import save_file
+
+    prefix, head = f"{loaded.model.base_model_prefix}.", head.detach().contiguous()
     merged = lora.merged_state(loaded.model, loaded.adapter)
     state = {name: tensor for name, tensor in merged.items() if name.startswith(prefix)}
     state = {name: tensor.cpu() for name, tensor in {**state, "score.weight": head}.items()}
@@ -57,25 +58,11 @@ def save_reward(
         (folder / "README.md").write_text(card(shift, loaded.source, final), encoding="utf-8")
     if loaded.adapter is not None:
         with atomic_folder(path / "adapter") as folder:
-            _save_adapter(folder, head, shift, loaded)
-
-
-def _save_adapter(folder: Path, head: Tensor, shift: float, loaded: Loaded) -> None:
-    """The adapter with its head, in PEFT's format, and the head with its shift once more for alignment."""
-    from safetensors.torch import load_file, save_file
-
-    assert loaded.adapter is not None
-    save_adapter(loaded.model, loaded.adapter, folder, base_model=loaded.source, task_type="SEQ_CLS")
-    score = head.cpu().contiguous()
-    weights = load_file(folder / "adapter_model.safetensors")
-    weights["base_model.model.score.weight"] = score
-    save_file(weights, folder / "adapter_model.safetensors", metadata={"format": "pt"})
-    config = json.loads((folder / "adapter_config.json").read_text(encoding="utf-8"))
-    config["modules_to_save"] = ["score"]
-    (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-    shifted = {"score.weight": score.clone(), "shift": torch.tensor(shift, dtype=torch.float64)}
-    trunk = fingerprint(loaded.source)
-    save_file(shifted, folder / "head.safetensors", metadata={"trunk": trunk} if trunk else None)
+            save_adapter(loaded.model, loaded.adapter, folder, base_model=loaded.source, score=head)
+            # the head with its shift, for alignment
+            shifted = {"score.weight": head.cpu(), "shift": torch.tensor(shift, dtype=torch.float64)}
+            trunk = weights_fingerprint(loaded.source)
+            save_file(shifted, folder / "head.safetensors", metadata={"trunk": trunk} if trunk else None)
 
 
 def card(shift: float, source: str, final: dict[str, float]) -> str:
@@ -95,8 +82,8 @@ model = AutoModelForSequenceClassification.from_pretrained("this/folder", num_la
 score = model(input_ids).logits[:, 0] - ({shift!r})
 ```
 
-Scores have mean 0 and deviation 1 on demonstrations **after the shift {shift!r} is subtracted**. It stands in
-config.json as `{SHIFT}`; tightrope subtracts it, other programs do not. The gain is part of the head.
+Scores have mean 0 and deviation 1 on demonstrations **after the shift {shift!r} is subtracted**. It is stored
+in config.json as `{SHIFT}`; tightrope subtracts it, other programs do not. The gain is part of the head.
 
 The score is read at the last token of a text, which should be its end-of-sequence token. Pad on the right,
 with the `pad_token_id` of config.json; where that is null, score one text at a time.

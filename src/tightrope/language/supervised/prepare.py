@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any, NamedTuple
 
 import torch
+from torch import nn
 
-from tightrope.language.data.examples import Row, read_rows
-from tightrope.language.memory import available_memory, check, job_of, ledger
+from tightrope.language.data.examples import Item, Row, hold_out, read_rows
+from tightrope.language.memory import job_of, require_memory
 from tightrope.language.model import lora
 from tightrope.language.model.load import (
     eos_ids,
@@ -37,6 +38,12 @@ class Loaded(NamedTuple):
     eos: tuple[int, ...]
     adapter: str | None
 
+    def trained(self, part: nn.Module) -> list[nn.Parameter]:
+        """What is trained where ``part`` of the model is: its weights, or the adapter's."""
+        if self.adapter is None:
+            return list(part.parameters())
+        return lora.adapter_parameters(self.model, self.adapter)
+
 
 @contextlib.contextmanager
 def prepared(
@@ -47,35 +54,35 @@ def prepared(
     """
     require_device(settings.device)
     with threads(settings.threads), signals.stoppable():
-        present_memory(settings, given, listeners)
-        loaded = load(settings, adapter, given)
+        _require_memory(settings, given, listeners)
+        loaded = load_for_training(settings, adapter, given)
         with lora.using(loaded.model, loaded.adapter):
             yield loaded
 
 
-def present_memory(settings: SupervisedSettings, given: tuple[Any, Any] | None, listeners: Listeners) -> None:
-    """Report what the job will take, and refuse it with advice when it cannot fit: from the config alone.
-
-    The weights of a model that is given, where they lie on the device already, need no more room.
+def _require_memory(
+    settings: SupervisedSettings, given: tuple[Any, Any] | None, listeners: Listeners
+) -> None:
+    """Refuse a job that cannot fit; only the config is read. A model that is given and is on the device
+    already needs no more room for its weights.
     """
     from transformers import AutoConfig
 
     place = torch.device(settings.device)
     weights = [] if given is None else [p for p in given[0].parameters() if p.device.type == place.type]
     config = pretrained(AutoConfig, find_model(settings.model)) if given is None else given[0].config
-    found, available = ledger(config, job_of(settings)), available_memory(place)
-    listeners.info(found.text())
-    check(found, None if available is None else available + sum(p.nbytes for p in weights))
+    held = sum(p.nbytes for p in weights)
+    require_memory(config, job_of(settings), place, listeners.info, held)
 
 
-def load(settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None = None) -> Loaded:
+def load_for_training(
+    settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None = None
+) -> Loaded:
     """Load the settings' model, or take a (model, tokenizer) that is given and train it in place.
 
-    Tuned in full, the weights stay float32 whatever ``dtype`` says: a step of 1e-5 is lost on a bfloat16
-    weight; `precision` then lowers the arithmetic alone. ValueError when max_tokens exceeds the context, or
-    the device is not there.
+    Tuned in full, the weights stay float32 with any ``dtype``: a step of 1e-5 is lost on a bfloat16
+    weight; `precision` then lowers only the arithmetic. ValueError when max_tokens exceeds the context.
     """
-    require_device(settings.device)
     if given is not None:
         source = given[0].name_or_path or settings.model
     else:
@@ -93,7 +100,7 @@ def load(settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | No
     eos = sorted(eos_ids(model, tokenizer), key=lambda token: token != tokenizer.eos_token_id)
     if settings.gradient_checkpointing:
         lora.checkpoint_activations(model)
-        model.train()  # transformers checkpoints in training mode alone; dropout is 0 everywhere
+        model.train()  # transformers checkpoints only in training mode; dropout is 0 everywhere
     if settings.tune == "full":
         return Loaded(model.requires_grad_(True), tokenizer, source, tuple(eos), None)
     layers = lora.top_layers(model, settings.lora_layers)
@@ -105,7 +112,7 @@ def load(settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | No
 def precision(settings: SupervisedSettings) -> Iterator[None]:
     """The arithmetic of one forward pass: bfloat16 over float32 weights where all of them are trained.
 
-    Never around a step of the optimiser: inside, torch keeps the lowered weights it has made.
+    Never use it around a step of the optimiser: torch keeps the lowered weights that it made inside.
     """
     lowered = settings.tune == "full" and settings.dtype == "bfloat16"
     with torch.autocast(torch.device(settings.device).type, torch.bfloat16, enabled=lowered):
@@ -123,9 +130,21 @@ def threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def training_rows(settings: SupervisedSettings, data: Any) -> list[Row]:
-    """The rows of ``data``, or of the file that the settings name. ValueError when there is neither."""
-    source = settings.data if data is None else data
+def examples_of(
+    settings: SupervisedSettings,
+    given: dict[str, Any],
+    read: Callable[[list[Row]], list[Item]],
+    group: Callable[[Item], Hashable] | None = None,
+) -> tuple[list[Item], list[Item]]:
+    """Examples to train on, and those held out: from what was ``given``, or from the files that the settings
+    name; without validation data a share of the others. ``read`` makes examples of rows, ``group`` is that of
+    `hold_out`. ValueError where there is nothing to train on.
+    """
+    source = settings.data if given["data"] is None else given["data"]
     if isinstance(source, str) and not source:
         raise ValueError("There is no data. Give --data FILE, or data= in Python.")
-    return read_rows(source, settings.max_examples)
+    examples = read(read_rows(source, settings.max_examples))
+    source = settings.validation if given["validation"] is None else given["validation"]
+    if source is not None:
+        return examples, read(read_rows(source))
+    return hold_out(examples, settings.held_out, settings.seed, group)

@@ -1,6 +1,6 @@
 """The first stage: supervised fine-tuning of a causal language model on text, completions or chats.
 
-L = - sum over learnt tokens of log p(token | what stands before it) / their number in the minibatch
+L = - sum over learnt tokens of log p(token | the tokens before it) / their number in the minibatch
 """
 
 from __future__ import annotations
@@ -12,17 +12,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tightrope.language.data.batching import Example, Packed, attention_of, collate, pack, row_of
-from tightrope.language.data.examples import Row, hold_out, read_rows, sft_examples
+from tightrope.language.data.batching import Example, Packed, attention_of, collate, pack_rows, row_of
+from tightrope.language.data.examples import Row, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
-from tightrope.language.model import lora
 from tightrope.language.model.parts import attention_window, parts
 from tightrope.language.model.saving import save_model
-from tightrope.language.quiet import quiet
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, micro_batches
-from tightrope.language.supervised.prepare import Loaded, precision, prepared, training_rows
-from tightrope.language.supervised.run import recorded, reopened, train_supervised
+from tightrope.language.supervised.prepare import Loaded, examples_of, precision
+from tightrope.language.supervised.run import Stage, resume_stage, train_stage
 from tightrope.training.events import Listener, Listeners
 
 PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
@@ -32,7 +30,7 @@ def hidden_states(model: Any, rows: Packed) -> Tensor:
     """Hidden states [B, N, d] of right-padded rows; no text sees padding, or another text of its row."""
     base = parts(model).base
     if not bool((rows.segments > 0).any()):
-        # One text a row: padding stands behind it, where causal attention never looks.
+        # One text a row: the padding follows it, and causal attention never looks ahead.
         return base(input_ids=rows.tokens, use_cache=False).last_hidden_state
     allowed = attention_of(rows.segments)
     # Added to the scores by every implementation of attention; some would add a boolean mask as 0 and 1.
@@ -45,7 +43,7 @@ def hidden_states(model: Any, rows: Packed) -> Tensor:
 @torch.no_grad()
 def require_packable(model: Any, longest: int) -> None:
     """ValueError for a model whose loss would not be the same when texts share a row of ``longest`` tokens:
-    one whose attention looks back over a shorter window, or that reads attention masks in another way.
+    its attention has a shorter window, or it reads attention masks differently.
     """
     name, window = type(model).__name__, attention_window(model)
     if window is not None and window < longest:
@@ -86,7 +84,6 @@ def mean_loss(model: Any, rows: Sequence[Packed], size: int) -> float:
     return total / count
 
 
-@quiet()
 def train_sft(
     settings: SFTSettings,
     *,
@@ -101,17 +98,14 @@ def train_sft(
     ``data`` and ``validation`` replace the files that the settings name: rows in any format of
     `sft_examples`. ``model``: a (model, tokenizer) that is trained in place. The run folder holds
     settings.json, metrics.jsonl, summary.json and ``model``, which AutoModelForCausalLM.from_pretrained
-    loads, with tokenizer and chat template; tuned by LoRA the adapter is folded into it, and lies in
-    ``adapter`` for PEFT as well. Raises ValueError for data or settings that cannot work, before anything is
-    trained, and DoesNotFit, which is one, for too little memory, before the model is loaded.
+    loads, with tokenizer and chat template; tuned by LoRA the adapter is folded into it, and is also
+    written to ``adapter`` for PEFT. Raises ValueError for data or settings that cannot work, before anything
+    is trained, and DoesNotFit, which is one, for too little memory, before the model is loaded.
     """
-    settings = recorded(settings, data=data, validation=validation, model=model and model[0])
-    told = Listeners(listeners)
-    with prepared(settings, "sft", model, told) as loaded:
-        return _train(settings, loaded, data, validation, told, run_dir)
+    given = {"data": data, "validation": validation}
+    return train_stage(SFT_STAGE, settings, given, model, listeners, run_dir)
 
 
-@quiet()
 def resume_sft(
     run_dir: str | Path,
     *,
@@ -120,24 +114,20 @@ def resume_sft(
     model: tuple[Any, Any] | None = None,
     listeners: Sequence[Listener] = (),
 ) -> dict[str, Any]:
-    """Go on from a run's newest checkpoint, or from its beginning where there is none yet; the end is that of
-    a run without a break, bit for bit.
+    """Continue a run from its newest checkpoint, or from its beginning where there is none yet. It ends like
+    an uninterrupted run, bit for bit.
 
     What `train_sft` was given as an object is given again, the model as it was before training. Files are
     read again. ValueError names what is missing.
     """
-    given = {"data": data, "validation": validation, "model": model and model[0]}
-    run, settings = reopened(SFTSettings, run_dir, **given)
-    told = Listeners(listeners)
-    with run, prepared(settings, "sft", model, told) as loaded:
-        return _train(settings, loaded, data, validation, told, run)
+    return resume_stage(SFT_STAGE, run_dir, {"data": data, "validation": validation}, model, listeners)
 
 
-def _train(
-    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, listeners: Listeners, place: Any
-) -> dict[str, Any]:
+def _objective(
+    settings: SFTSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners
+) -> Objective:
     model, size = loaded.model, settings.micro_batch_size or settings.minibatch_size
-    rows, held = _rows(settings, loaded, data, validation, listeners)
+    rows, held = _rows(settings, loaded, given, listeners)
 
     def loss(items: Sequence[Packed]) -> tuple[Tensor, dict[str, Tensor]]:
         with precision(settings):
@@ -153,12 +143,14 @@ def _train(
         save_model(model, loaded.tokenizer, folder, loaded.adapter, loaded.source)
         return {"rows": len(rows), "held_out_rows": len(held), "tokens": learnt}
 
-    parameters = list(model.parameters())
-    if loaded.adapter is not None:
-        parameters = lora.adapter_parameters(model, loaded.adapter)
-    objective = Objective("sft", "sft", rows, loss, _learnt, len, evaluate, save, seen="sft/tokens")
-    words = f"{len(rows)} rows, {learnt:,} tokens to learn; {len(held)} rows held out"
-    return train_supervised(objective, parameters, settings, loaded, place, listeners, words)
+    return Objective(
+        "sft", "sft", rows, loss, _learnt, len, evaluate, save,
+        seen="sft/tokens", parameters=loaded.trained(model),
+        data=f"{len(rows)} rows, {learnt:,} tokens to learn; {len(held)} rows held out",
+    )  # fmt: skip
+
+
+SFT_STAGE = Stage("sft", SFTSettings, _objective)
 
 
 def _learnt(row: Packed) -> int:
@@ -166,13 +158,13 @@ def _learnt(row: Packed) -> int:
 
 
 def _rows(
-    settings: SFTSettings, loaded: Loaded, data: Any, validation: Any, listeners: Listeners
+    settings: SFTSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners
 ) -> tuple[list[Packed], list[Packed]]:
     """The rows to train on and those held out; packed apart, so that nothing held out is trained on."""
 
-    def examples(source: list[Row]) -> list[Example]:
+    def read(rows: list[Row]) -> list[Example]:
         return sft_examples(
-            source,
+            rows,
             loaded.tokenizer,
             eos=loaded.eos,
             max_tokens=settings.max_tokens,
@@ -180,12 +172,8 @@ def _rows(
             notify=listeners.warn,
         )
 
-    own, held = examples(training_rows(settings, data)), []
-    if (source := settings.validation if validation is None else validation) is not None:
-        held = examples(read_rows(source))
-    else:
-        own, held = hold_out(own, settings.held_out, settings.seed)
+    own, held = examples_of(settings, given, read)
     if settings.pack:
         require_packable(loaded.model, settings.max_tokens)
-        return pack(own, settings.max_tokens), pack(held, settings.max_tokens)
+        return pack_rows(own, settings.max_tokens), pack_rows(held, settings.max_tokens)
     return [row_of([example]) for example in own], [row_of([example]) for example in held]

@@ -28,7 +28,7 @@ import numpy as np
 from numba.core import codegen, compiler, compiler_lock, serialize
 from numba.core.registry import cpu_target
 
-from tightrope.control.engine.compiled.primitives import FLAGS, INNER, LATE, OPTIONS, njit
+from tightrope.control.engine.compiled.primitives import COMPILE_OPTIONS, FLAGS, INNER, LATE, njit
 
 SWITCH = "TIGHTROPE_NUMBA_CACHE"
 KEPT_DAYS = 90
@@ -89,7 +89,7 @@ def entry(signature: str) -> Callable[[Callable[..., Any]], Any]:
         if found is not None:
             return found
         with _whole_programs():
-            made = njit(signature, fastmath=FLAGS, **OPTIONS)(function)
+            made = njit(signature, fastmath=FLAGS, **COMPILE_OPTIONS)(function)
         if folder is not None:
             store_entry(folder, function, made)
         return made
@@ -175,7 +175,7 @@ def load_entry(folder: Path, function: Callable[..., Any]) -> Any:
         with compiler_lock.global_compiler_lock:
             state = pickle.loads(data[_DIGEST:])
             result = compiler.CompileResult._rebuild(cpu_target.target_context, *state)
-            dispatcher = njit(fastmath=FLAGS, **OPTIONS)(function)
+            dispatcher = njit(fastmath=FLAGS, **COMPILE_OPTIONS)(function)
             dispatcher.add_overload(result)
             dispatcher.disable_compile()
     except Exception:  # no entry, or one of another numba: to be compiled

@@ -22,7 +22,7 @@ ALIGNMENT = 16  # float32 numbers in a cache line
 # columns of the table of layers, and the activations
 INPUTS, OUTPUTS, WEIGHT, BIAS, ACTIVATION, VALUE, DELTA, SLOPE, FEED = range(9)
 NONE, TANH, RELU, ELU, SILU = range(5)
-ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU, nn.ELU: ELU, nn.SiLU: SILU}
+ACTIVATION_CODES = {nn.Tanh: TANH, nn.ReLU: RELU, nn.ELU: ELU, nn.SiLU: SILU}
 
 # columns of the table of components (of the action), and the kinds of a component
 KIND, PARAMETER, COUNT, COLUMN, MASK, DEVIATION, ENTROPY_ROW = range(7)
@@ -91,7 +91,7 @@ def _uncovered_network(network: nn.Module | None, *, ends_linear: bool) -> str |
             if module.bias is None:
                 return "layers without bias"
             linear = True
-        elif isinstance(module, tuple(ACTIVATIONS)) and linear:
+        elif isinstance(module, tuple(ACTIVATION_CODES)) and linear:
             if isinstance(module, nn.ELU) and module.alpha != 1:
                 return "ELU with another alpha than 1"
             linear = False
@@ -154,7 +154,7 @@ def make_plan(policy: Any) -> Plan:
         first = len(table)
         for module in modules:
             if not isinstance(module, nn.Linear):
-                table[-1][ACTIVATION] = ACTIVATIONS[type(module)]
+                table[-1][ACTIVATION] = ACTIVATION_CODES[type(module)]
                 if isinstance(module, nn.SiLU):
                     table[-1][SLOPE] = reserve(table[-1][OUTPUTS])
                 continue
@@ -173,10 +173,8 @@ def make_plan(policy: Any) -> Plan:
 
     layout = policy.layout
     components = np.zeros((len(layout.components), 7), np.int64)
-    deviations = 0
     for i, c in enumerate(layout.components):
-        components[i] = [COMPONENT_KINDS[c.kind], c.parameter, c.count, c.column, c.mask, deviations, i]
-        deviations += c.count if c.kind == "gaussian" else 0
+        components[i] = [COMPONENT_KINDS[c.kind], c.parameter, c.count, c.column, c.mask, c.deviation, i]
     places = np.zeros(PLACES, np.int64)
     places[LOGITS], places[DELTAS] = table[actor[1] - 1][VALUE], table[actor[1] - 1][DELTA]
     places[LOGS] = reserve(layout.num_parameters)
@@ -186,7 +184,7 @@ def make_plan(policy: Any) -> Plan:
     places[VECTORS] = reserve(NUM_VECTORS)
     places[FEATURES], places[COLUMNS] = table[0][INPUTS], layout.num_columns
     places[MASK_WIDTH], places[PARAMETERS] = layout.num_logits, layout.num_parameters
-    places[LOG_STD], places[DEVIATIONS] = log_std, deviations
+    places[LOG_STD], places[DEVIATIONS] = log_std, layout.gaussian.sum()
     places[ACTOR_FIRST:] = [*actor, *critic, trunk]
     halves = ((0, middle), (middle, cursor))
     return Plan(parameters, halves, cursor, work, places, np.array(table, np.int64), components)

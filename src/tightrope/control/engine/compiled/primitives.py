@@ -26,7 +26,7 @@ from numba import types
 from numba.core import cgutils
 
 FLAGS = {"contract", "reassoc", "arcp", "nsz", "afn"}
-OPTIONS: dict[str, Any] = {  # of every function
+COMPILE_OPTIONS: dict[str, Any] = {  # of every function
     "nogil": True,
     "error_model": "numpy",
     "no_cfunc_wrapper": True,
@@ -43,7 +43,7 @@ njit: Any = numba.njit
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile loops over rows; the compiler may reorder their sums and products (always in the same way)."""
     INNER.add(function.__name__)
-    return njit(fastmath=FLAGS, no_cpython_wrapper=True, **OPTIONS)(function)
+    return njit(fastmath=FLAGS, no_cpython_wrapper=True, **COMPILE_OPTIONS)(function)
 
 
 def composite(function: Callable[..., Any]) -> Any:
@@ -57,7 +57,7 @@ def scalar(function: Callable[..., Any]) -> Any:
     reordered, and only multiply-add is fused."""
     INNER.add(function.__name__)
     LATE.add(function.__name__)
-    return njit(fastmath={"contract"}, forceinline=True, no_cpython_wrapper=True, **OPTIONS)(function)
+    return njit(fastmath={"contract"}, forceinline=True, no_cpython_wrapper=True, **COMPILE_OPTIONS)(function)
 
 
 def _sgemm_address() -> int:
