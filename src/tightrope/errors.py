@@ -19,8 +19,8 @@ Each class also inherits the builtin beside it, so ``except ValueError`` still c
 setting or an argument with a wrong value raises a plain ValueError, as in the standard library.
 
 Two classes are not errors and stay outside: `runs.signals.Stopped` (a KeyboardInterrupt) and
-`EnvironmentTimeout` (a BaseException). They end a run or a call from outside. ``except Exception`` in the code
-of a user must not catch them, and neither must ``except TightropeError``.
+`EnvironmentTimeout` (a BaseException). They end a run or a call from outside. ``except Exception`` in the
+code of a user must not catch them, and neither must ``except TightropeError``.
 """
 
 __all__ = ["TightropeError"]
