@@ -170,10 +170,10 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     return _summary(options, run, seconds, alarms, gold, openings(for_prompts[:kept], JUDGED))
 
 
-def _display(columns: Any, what: str) -> Any:
+def _display(view: Any) -> Any:
     from tightrope.cli.display import Display, can_live
 
-    return Display(columns, what, sys.stdout, live=can_live(sys.stdout, dict(os.environ)))
+    return Display(view, sys.stdout, live=can_live(sys.stdout, dict(os.environ)))
 
 
 def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, Any]) -> str:
@@ -187,7 +187,7 @@ def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, A
         rng = random.Random(4)
         texts = [{"text": window(text, 26, ENDS[model], rng)} for text, _ in rows for _ in range(3)]
         settings = SFTSettings(model=model, data="film reviews", seed=0, **values)
-        with _display(SFT, "steps") as display:
+        with _display(SFT) as display:
             train_sft(settings, data=texts, run_dir=out / "sft", listeners=[display])
     return str(out / "sft" / "model")
 
@@ -202,7 +202,7 @@ def _reward(out: Path, model: str, rows: list[tuple[str, int]], ends: float, val
         print("\n2. Reward model: a stretch of praise is preferred to one of blame")
         settings = RewardSettings(model=model, data="pairs of film reviews", seed=0, **values)
         data = pairs(rows, 24, ends, values["max_examples"])
-        with _display(REWARD, "steps") as display:
+        with _display(REWARD) as display:
             train_reward(settings, data=data, run_dir=out / "reward", listeners=[display])
     return str(out / "reward")
 
@@ -218,7 +218,7 @@ def _align(
     print("\n3. PPO towards what the reward model prefers, held near the reference by the KL")
     begin, alarms, step = time.perf_counter(), list[dict[str, Any]](), 0
 
-    with _display(ALIGN, "responses") as display:
+    with _display(ALIGN) as display:
 
         def listen(event: Event) -> None:
             nonlocal step

@@ -19,6 +19,7 @@ import pytest
 from tightrope.cli import display, flags, options
 from tightrope.cli.main import main
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+from tightrope.metrics.table import METRICS
 from tightrope.settings.fields import range_text
 from tightrope.training.events import Evaluated, Finished, Listeners, Started, Updated
 
@@ -443,7 +444,7 @@ def clean_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
 
 def fake_training(train: Any) -> None:
     module = types.ModuleType("tightrope.control.train")
-    module.train = train  # type: ignore[attr-defined]
+    module.train = module.resume = train  # type: ignore[attr-defined]
     sys.modules["tightrope.control.train"] = module
 
 
@@ -596,7 +597,7 @@ def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) 
             return True
 
     stream = Terminal()
-    report = display.choose(stream, quiet=False, live=True)
+    report = display.Display(display.CONTROL, stream, live=True)
     begin = time.monotonic()
     with report:
         a_run(tmp_path)(TrainSettings(), None, [report])
@@ -659,7 +660,7 @@ def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
         def write(self, text: str) -> int:
             raise BrokenPipeError
 
-    report = display.choose(Gone(), quiet=False, live=False)
+    report = display.Display(display.CONTROL, Gone())
     with report:
         summary = a_run(tmp_path)(TrainSettings(), None, [report])
     assert summary == SUMMARY
@@ -669,8 +670,41 @@ def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
 def test_time_left_counts_this_runs_steps_only(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    progress = display.Position()
-    progress.take(Started("run", SETTINGS, 400, 1000, ()))
+    progress = display.Display(display.CONTROL, sys.stdout)
+    progress(Started("run", SETTINGS, 400, 1000, ()))
     now[0] += 10.0
-    progress.take(Updated(600, 1000, 1.0, {}))
+    progress(Updated(600, 1000, 1.0, {}))
     assert progress.seconds_left() == pytest.approx(20.0)
+
+
+VIEWS = {"control": display.CONTROL, "align": display.ALIGN, "sft": display.SFT, "reward": display.REWARD}
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_every_column_shows_declared_metrics(name: str) -> None:
+    for column in VIEWS[name].columns:
+        assert all(metric in METRICS for metric in column.metrics)
+        assert len(column.form(*(12345.678 for _ in column.metrics))) < 2 * column.width
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_every_view_has_lines_and_a_panel(name: str) -> None:
+    """The newest figure of each column stays; the last update has a line or is in the panel."""
+    import io
+
+    view = VIEWS[name]
+    for live in (False, True):
+        stream = io.StringIO()
+        with display.Display(view, stream, live=live) as shown:
+            shown(Started("run", SETTINGS, 0, 1000, ("a fact",)))
+            first, *others = (metric for column in view.columns for metric in column.metrics)
+            shown(Updated(10, 1000, 1.0, dict.fromkeys(others, 0.25)))
+            shown(Updated(20, 1000, 2.0, {first: 0.5, others[0]: float("nan")}))
+            shown(Finished({}))
+        last = stream.getvalue().splitlines()[-8:]
+        text = "\n".join(last)
+        cells = [
+            column.form(*(0.5 if m == first else 0.25 for m in column.metrics)) for column in view.columns
+        ]
+        assert all(cell in text for cell in cells), text
+        assert "a fact" in stream.getvalue() and view.counted in stream.getvalue()

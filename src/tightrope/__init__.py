@@ -9,12 +9,14 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from tightrope.errors import TightropeError
+
 if TYPE_CHECKING:
     from tightrope.control.agent import A2C, PPO, Reinforce
     from tightrope.control.saving import load
 
 __version__ = "0.1.0"
-__all__ = ["A2C", "PPO", "Reinforce", "__version__", "load"]
+__all__ = ["A2C", "PPO", "Reinforce", "TightropeError", "__version__", "load"]
 
 _HOMES = {
     "A2C": "tightrope.control.agent",

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import tomllib
 
 import pytest
-from source_tree import ROOT, SRC, name_of, sources, tree
+from source_tree import ROOT, SRC, module_of, name_of, sources, tree
 
 import tightrope
 
@@ -43,11 +44,71 @@ def test_names_are_sorted():
                 assert names == sorted(names), name_of(path)
 
 
+# packages that do not list their public names yet; take one out when it does, never add one
+WITHOUT_ALL = {
+    "tightrope.control.engine",
+    "tightrope.control.engine.compiled",
+    "tightrope.control.environments",
+    "tightrope.control.policy",
+    "tightrope.control.rollout",
+    "tightrope.language.alignment",
+    "tightrope.language.data",
+    "tightrope.language.generation",
+    "tightrope.language.model",
+    "tightrope.language.policy",
+    "tightrope.language.reward",
+    "tightrope.language.supervised",
+}
+
+
+def test_packages_list_their_public_names():
+    found = set()
+    for path in sources():
+        if path.name == "__init__.py":
+            package = importlib.import_module(module_of(path))
+            if not hasattr(package, "__all__"):
+                found.add(module_of(path))
+            for name in getattr(package, "__all__", ()):
+                there = (path.parent / f"{name}.py").is_file() or getattr(package, name) is not None
+                assert there, f"{module_of(path)} has no {name}"
+    assert found == WITHOUT_ALL
+
+
 def test_every_public_name_is_there():
     for name in tightrope.__all__:
         assert getattr(tightrope, name) is not None
     with pytest.raises(AttributeError, match="it has A2C"):
         tightrope.Nothing  # noqa: B018 - to ask for it is the test
+
+
+# no errors: they end a run or a call from outside, and `except Exception` must not catch them
+STOP_SIGNALS = {"tightrope.runs.signals.Stopped", "tightrope.control.environments.faults.EnvironmentTimeout"}
+
+
+def exceptions() -> dict[str, type[BaseException]]:
+    """Every exception class of the package by its full name."""
+    found = {}
+    for path in sources():
+        names = [node.name for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef) and node.bases]
+        module = importlib.import_module(module_of(path)) if names and path.stem != "__main__" else None
+        for name in names:
+            kind = getattr(module, name, None)
+            if isinstance(kind, type) and issubclass(kind, BaseException):
+                found[f"{kind.__module__}.{name}"] = kind
+    return found
+
+
+def test_every_exception_has_the_one_base():
+    """errors.py names each of them; stop signals are no errors."""
+    found = exceptions()
+    outside = {name for name, kind in found.items() if not issubclass(kind, tightrope.TightropeError)}
+    assert outside == STOP_SIGNALS
+    assert not any(issubclass(found[name], Exception) for name in STOP_SIGNALS)
+    drawn = tightrope.errors.__doc__
+    for name, kind in found.items():
+        assert kind.__name__ in drawn, name
+        other = kind.__bases__[1].__name__ if len(kind.__bases__) > 1 else kind.__name__
+        assert other in drawn, f"{name} inherits {other}"
 
 
 def test_version_is_the_same_everywhere():

@@ -13,7 +13,7 @@ import torch
 
 from tightrope.runs import versions
 
-LIBRARIES = (*versions.LIBRARIES, "tokenizers", "llvmlite")
+LIBRARIES = (*versions.VERSIONED, "tokenizers", "llvmlite")
 # Some 15 times what was seen with AVX2 and plain SSE2, other kernels of MKL and OpenBLAS, another target of
 # numba, transformers 5.0, numpy 2.3 and gymnasium 1.2: at most 2e-5 of a number + 2e-6. In runs as
 # short as these rounding cannot grow.

@@ -18,7 +18,7 @@ from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.runs import checkpoint, history, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY, CannotWrite, remove_leftovers, writing
-from tightrope.runs.tensors import content
+from tightrope.runs.tensors import safetensors_bytes
 
 
 def tensors() -> dict[str, dict[str, torch.Tensor]]:
@@ -269,8 +269,8 @@ def test_a_manifest_imports_no_library(tmp_path: Path) -> None:
 
 def test_other_versions_are_told(folder: Path) -> None:
     written = checkpoint.read_manifest(folder)["versions"]
-    assert versions.differences(written) == ""
-    assert versions.differences({**written, "torch": "1.0"}) == f"torch 1.0 -> {torch.__version__}"
+    assert versions.version_changes(written) == ""
+    assert versions.version_changes({**written, "torch": "1.0"}) == f"torch 1.0 -> {torch.__version__}"
 
 
 DTYPES = [
@@ -288,14 +288,14 @@ def test_every_reader_of_safetensors_reads_ours(tmp_path: Path) -> None:
         values = numbers.to(dtype)
         wanted |= {f"{name} matrix": values, f"{name} view": values.T, f"{name} none": values[:0]}
         wanted |= {f"{name} scalar": values[1, 2], f"{name} column": values[:, 1]}
-    (tmp_path / "x.safetensors").write_bytes(b"".join(content(wanted)))
+    (tmp_path / "x.safetensors").write_bytes(b"".join(safetensors_bytes(wanted)))
     read = load_file(tmp_path / "x.safetensors")
     assert set(read) == set(wanted)
     for name, tensor in wanted.items():
         assert read[name].dtype == tensor.dtype and read[name].shape == tensor.shape
         assert torch.equal(read[name], tensor)
     with pytest.raises(ValueError, match="z is a tensor of complex64"):
-        list(content({"z": torch.zeros(1, dtype=torch.complex64)}))
+        list(safetensors_bytes({"z": torch.zeros(1, dtype=torch.complex64)}))
 
 
 def test_a_failed_replacement_keeps_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,6 @@ import pytest
 from language.tiny import saved, tiny_llama
 
 from tightrope.cli import display
-from tightrope.cli.display import ALIGN, Display
 from tightrope.control.settings import TrainSettings
 from tightrope.control.train import resume, train
 from tightrope.language.alignment.align import align
@@ -82,12 +81,12 @@ def test_what_a_run_sends(run: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("quiet", [False, True])
-def test_both_displays_know_a_warning_by_its_level(quiet: bool, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_display_knows_a_warning_by_its_level(quiet: bool, capsys: pytest.CaptureFixture[str]) -> None:
     """The text of a fact may begin with any word; that of a warning need not."""
     import sys
 
-    shown = display.choose(sys.stdout, quiet=quiet, live=False), Display(ALIGN, "x", sys.stdout, quiet=quiet)
-    for one in shown:
+    for view in (display.CONTROL, display.SFT, display.REWARD, display.ALIGN):
+        one = display.Display(view, sys.stdout, quiet=quiet)
         listeners = Listeners([one])
         listeners.warn("clip is high")
         listeners.info("warning: is the first word of a fact")

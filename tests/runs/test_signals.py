@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tightrope.cli import farewell
+from tightrope.cli.training import farewell
 from tightrope.runs import signals
 
 BOTH = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -28,14 +28,14 @@ def test_a_signal_stops_at_once_and_says_its_exit_code(number, code):
         os.kill(os.getpid(), number)
         time.sleep(5)
         pytest.fail("it went on")
-    assert caught.value.code == farewell.code_of(caught.value) == code
+    assert caught.value.code == code
     assert signal.getsignal(number) == before
 
 
 def test_a_save_is_finished_first():
     steps = []
-    with pytest.raises(signals.Stopped), signals.stoppable(), signals.whole():
-        with signals.whole():
+    with pytest.raises(signals.Stopped), signals.stoppable(), signals.uninterrupted():
+        with signals.uninterrupted():
             os.kill(os.getpid(), signal.SIGTERM)
             steps.append("inner")
         steps.append("outer")
@@ -43,7 +43,7 @@ def test_a_save_is_finished_first():
 
 
 def test_a_second_signal_does_not_wait():
-    with pytest.raises(signals.Stopped) as caught, signals.stoppable(), signals.whole():
+    with pytest.raises(signals.Stopped) as caught, signals.stoppable(), signals.uninterrupted():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGINT)
         pytest.fail("it went on")
@@ -54,14 +54,14 @@ def test_what_swallows_a_signal_is_stopped_at_the_next_update():
     with pytest.raises(signals.Stopped), signals.stoppable():
         with contextlib.suppress(BaseException):  # as a reward function may
             os.kill(os.getpid(), signal.SIGINT)
-        signals.check()
-    signals.check()  # outside, and later, nothing is left of it
+        signals.raise_if_stopped()
+    signals.raise_if_stopped()  # outside, and later, nothing is left of it
 
 
 def test_before_a_run_and_without_a_checkpoint(tmp_path):
     error = signals.Stopped(signal.SIGTERM)
-    assert farewell.farewell(error, None, 0, "steps", "") == "Stopped by SIGTERM before the run began."
-    said = farewell.farewell(KeyboardInterrupt(), str(tmp_path), 1200, "responses", "tightrope resume r")
+    assert farewell(error, None, 0, "steps", "") == "Stopped by SIGTERM before the run began."
+    said = farewell(KeyboardInterrupt(), str(tmp_path), 1200, "responses", "tightrope resume r")
     assert said.startswith("Stopped at response 1,200. There is no checkpoint yet: all 1,200 responses")
 
 

@@ -19,6 +19,7 @@ from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.algorithms.memory import MicroBatches
 from tightrope.algorithms.nonfinite import REFUSED, NonFiniteError, explain
 from tightrope.algorithms.settings import UpdateSettings
+from tightrope.errors import TightropeError
 from tightrope.maths import divergence, statistics, surrogate
 
 Model = Callable[[Batch], Evaluation]
@@ -37,7 +38,7 @@ class Terms(NamedTuple):
 Loss = Callable[[Evaluation, Tensor, Batch], Terms]  # (evaluation, log_ratio [B, T], part of the minibatch)
 
 
-class SamplingMismatch(RuntimeError):
+class SamplingMismatch(TightropeError, RuntimeError):
     """The probabilities that trained are not the probabilities that sampled."""
 
 

@@ -10,10 +10,12 @@ from typing import Any
 
 import torch
 
+from tightrope.errors import TightropeError
+
 SIGNS = ("out of memory", "not enough memory", "defaultcpuallocator")  # in the texts of torch's RuntimeErrors
 
 
-class OutOfMemory(RuntimeError):
+class OutOfMemory(TightropeError, RuntimeError):
     """Memory is not enough even for the smallest part; the message says which setting makes it smaller."""
 
 

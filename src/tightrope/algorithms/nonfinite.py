@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.algorithms.batch import Batch
+from tightrope.errors import TightropeError
 
 REFUSED = (
     "expected a finite number. That step was not taken and the weights are as before it. Look for extreme "
@@ -23,7 +24,7 @@ DATA = (
 )
 
 
-class NonFiniteError(FloatingPointError):
+class NonFiniteError(TightropeError, FloatingPointError):
     """A NaN or an infinity was met before a step; the weights are as they were before that step."""
 
 

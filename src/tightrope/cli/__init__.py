@@ -1,1 +1,3 @@
-"""The command line."""
+"""The command line. Internal: use the commands."""
+
+__all__: list[str] = []

@@ -18,7 +18,7 @@ OPTIONAL = {
 }
 
 
-def examine(model: str | None = None) -> list[Finding]:
+def examine_installation(model: str | None = None) -> list[Finding]:
     """The findings about this machine and installation; with ``model`` those about a language model too."""
     found = [
         _machine(),

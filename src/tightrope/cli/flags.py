@@ -7,14 +7,15 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
+from tightrope.errors import TightropeError
 from tightrope.settings.fields import kinds, range_text
 from tightrope.settings.peer_names import PEER_NAMES
 
 WIDTH = 100
 
 
-class UsageError(ValueError):
-    """The command line is wrong; the message says how, and what was probably meant."""
+class UsageError(TightropeError, ValueError):
+    """The command line is wrong; the message explains how, and suggests what was probably meant."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -118,7 +119,7 @@ def settings_fields(kind: type) -> dict[str, dataclasses.Field[Any]]:
     return {f.name: f for f in dataclasses.fields(kind) if f.init and f.name not in ("env", "update")}
 
 
-def add_fields(group: Any, kind: type, names: Iterable[str]) -> None:
+def add_fields(group: argparse._ArgumentGroup, kind: type, names: Iterable[str]) -> None:
     """One option a field: its help is made from doc, range and default."""
     fields = settings_fields(kind)
     for name in names:
@@ -167,7 +168,7 @@ def reader(kind: type, optional: bool, choices: tuple[str, ...]) -> Callable[[st
             )
         try:
             if kind is int:
-                return whole(word)
+                return whole_number(word)
             return kind(word)
         except ValueError:
             expected = {int: "a whole number", float: "a number"}[kind] + (" or none" if optional else "")
@@ -179,13 +180,13 @@ def reader(kind: type, optional: bool, choices: tuple[str, ...]) -> Callable[[st
 def width(word: str) -> int:
     """One entry of a list of whole numbers. The error explains that the task comes before the list."""
     try:
-        return whole(word)
+        return whole_number(word)
     except ValueError:
         text = f"{word!r} is not a whole number. Give the task before this list: train ENV --hidden 64 64"
         raise argparse.ArgumentTypeError(text) from None
 
 
-def whole(word: str) -> int:
+def whole_number(word: str) -> int:
     """A whole number, also as 100_000 or 1e6. Raises ValueError."""
     try:
         return int(word)

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import importlib.util
 import json
+import os
 import shlex
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +20,7 @@ from tightrope.cli.flags import (
     settings_fields,
     suggestion,
     unknown_flag,
-    whole,
+    whole_number,
     with_dashes,
 )
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
@@ -44,7 +48,7 @@ GROUPS = {
 }
 
 Options = dict[str, Any]
-KINDS: dict[str, type[Settings]] = {
+SETTINGS_CLASSES: dict[str, type[Settings]] = {
     "train": TrainSettings,
     "sft": SFTSettings,
     "reward": RewardSettings,
@@ -80,13 +84,13 @@ OWN_FIELDS = {"sft": "on_completions", "reward": "demonstrations", "align": "max
 
 
 def print_json(value: dict[str, Any]) -> None:
-    """A line of JSON on standard output: what --json promises, numbers that JSON cannot hold as null."""
+    """Print a line of JSON to standard output, for --json; numbers that JSON cannot hold become null."""
     from tightrope.runs.records import dumps
 
     print(dumps(value), flush=True)
 
 
-def output(parser: Parser) -> None:
+def _output(parser: Parser) -> None:
     """The options about what is printed, which every command has."""
     group = parser.add_argument_group("output")
     group.add_argument(
@@ -104,7 +108,7 @@ def dry_run(settings: Settings, given: Options) -> bool:
 
 def _common(parser: Parser, *, run: bool) -> None:
     """The options that several commands have."""
-    output(parser)
+    _output(parser)
     group = parser.add_argument_group("code of your own")
     group.add_argument(
         "--env-module",
@@ -115,14 +119,14 @@ def _common(parser: Parser, *, run: bool) -> None:
         group.add_argument(
             "--env",
             metavar="ID",
-            help="The task again; needed where its id names a module (default: the run's own).",
+            help="The task again; needed if its id names a module (default: the run's own).",
         )
 
 
 def training_parser(command: str, algorithm: str = "ppo") -> Parser:
     """The options of a command that trains; those of ``train`` with this update rule."""
     usage, description, epilog = DESCRIPTIONS[command]
-    kind = KINDS[command]
+    kind = SETTINGS_CLASSES[command]
     parser = Parser(f"{PROGRAM} {command}", f"%(prog)s {usage} [options]", description, epilog)
     if command == "train":
         parser.add_argument("env", nargs="?", metavar="ENV", help="Gymnasium id, like CartPole-v1.")
@@ -137,7 +141,7 @@ def training_parser(command: str, algorithm: str = "ppo") -> Parser:
             add_fields(group, rule, settings_fields(rule))
     folder = "ENV-ALGORITHM-SEED-TIME" if command == "train" else "COMMAND-MODEL-TIME"
     group = parser.add_argument_group("run")
-    group.add_argument("--run-dir", metavar="FOLDER", help=f"Where the run lies (default runs/{folder}).")
+    group.add_argument("--run-dir", metavar="FOLDER", help=f"Where the run is saved (default runs/{folder}).")
     group.add_argument(
         "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
     )
@@ -145,7 +149,7 @@ def training_parser(command: str, algorithm: str = "ppo") -> Parser:
     if command == "train":
         _common(parser, run=False)
     else:
-        output(parser)
+        _output(parser)
     if command == "align":
         parser.add_argument_group("recipes and judges").add_argument(
             "--recipe", choices=tuple(RECIPES), metavar="NAME", help=f"One of: {', '.join(RECIPES)}."
@@ -158,16 +162,16 @@ def _groups(command: str) -> Mapping[str, Iterable[str]]:
     if command == "train":
         return GROUPS
     shared = settings_fields(ModelSettings)
-    first = [name for name in settings_fields(KINDS[command]) if name not in shared]
+    first = [name for name in settings_fields(SETTINGS_CLASSES[command]) if name not in shared]
     if command == "align":
         return {"alignment": first, "update rule": (), "model and machine": shared}
     return {"data and training": first, "model and machine": shared}
 
 
-def run_parser(
+def _run_parser(
     command: str, description: str, folder: str = "Run folder, or a folder that agent.save wrote."
 ) -> Parser:
-    """The beginning of a command about a run: its name, and the argument RUN with ``folder`` as its help."""
+    """A parser for a command about a run, with the argument RUN; ``folder`` is its help."""
     parser = Parser(f"{PROGRAM} {command}", "%(prog)s RUN [options]", description)
     parser.add_argument("run", metavar="RUN", help=folder)
     return parser
@@ -175,11 +179,11 @@ def run_parser(
 
 def evaluate_parser() -> Parser:
     """The options of ``evaluate``."""
-    parser = run_parser(
+    parser = _run_parser(
         "evaluate", "Play episodes with the saved policy of a run: mean return, deviation, 95 % interval."
     )
     group = parser.add_argument_group("evaluation")
-    group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 100).")
+    group.add_argument("--episodes", type=_at_least_one, metavar="N", help="How many (default 100).")
     group.add_argument(
         "--stochastic", action="store_true", help="Sample actions; default: the most likely one."
     )
@@ -194,10 +198,10 @@ def evaluate_parser() -> Parser:
 
 def record_parser() -> Parser:
     """The options of ``record``."""
-    parser = run_parser("record", "Write an mp4 of the saved policy of a run; no display is needed.")
+    parser = _run_parser("record", "Write an mp4 of the saved policy of a run; no display is needed.")
     group = parser.add_argument_group("recording")
     group.add_argument("--out", metavar="FILE.mp4", help="Where to (default RUN/videos/).")
-    group.add_argument("--episodes", type=at_least_one, metavar="N", help="How many (default 1).")
+    group.add_argument("--episodes", type=_at_least_one, metavar="N", help="How many (default 1).")
     group.add_argument("--best", action="store_true", help="The policy that evaluated best, not the newest.")
     group.add_argument(
         "--seed",
@@ -211,36 +215,70 @@ def record_parser() -> Parser:
 
 def resume_parser() -> Parser:
     """The options of ``resume``."""
-    parser = run_parser(
-        "resume", "Go on with a run from its newest checkpoint, in the same folder.", "Run folder."
+    parser = _run_parser(
+        "resume", "Continue a run from its newest checkpoint, in the same folder.", "Run folder."
     )
-    group = parser.add_argument_group("going on")
+    group = parser.add_argument_group("continuing")
     group.add_argument(
         "--total-steps",
-        type=at_least_one,
+        type=_at_least_one,
         metavar="N",
         help="A new end (align: responses); also continues a finished run (default: the run's own).",
     )
     group.add_argument(
         "--reward",
         metavar="R",
-        help="align: the reward again, where it was your own code (default: the run's).",
+        help="align: the reward again, if it was your own code (default: the run's).",
     )
     group.add_argument(
         "--gold",
         metavar="R",
-        help="align: the gold judge again, where it was your own code (default: the run's).",
+        help="align: the gold judge again, if it was your own code (default: the run's).",
     )
     group.add_argument(
         "--data",
         metavar="FILE",
-        help="Language: the data again, where they were no file, or lie elsewhere (default: the run's).",
+        help="Language: the data again, if they were not a file or have moved (default: the run's).",
     )
     _common(parser, run=True)
     return parser
 
 
-def at_least_one(word: str) -> int:
+def sample_parser() -> Parser:
+    """The options of ``sample``."""
+    parser = _run_parser(
+        "sample", "Responses of the aligned model beside the reference's.", "Run folder of align."
+    )
+    group = parser.add_argument_group("sampling")
+    group.add_argument(
+        "--prompt", action="append", metavar="TEXT", help="A prompt of your own; may be repeated."
+    )
+    group.add_argument(
+        "--count", type=_at_least_one, metavar="N", help="How many prompts of the run's data (default 8)."
+    )
+    group.add_argument("--seed", type=int, metavar="N", help="Seed of sampling (default: the run's + 1).")
+    group.add_argument(
+        "--recorded",
+        action="store_true",
+        help="Sample nothing: show the last responses of training with their rewards, KL and advantage.",
+    )
+    _output(parser)
+    return parser
+
+
+def doctor_parser() -> Parser:
+    """The options of ``doctor``."""
+    parser = Parser(
+        f"{PROGRAM} doctor", "%(prog)s [--model M]", "Check this installation; with --model a language model."
+    )
+    parser.add_argument(
+        "--model", metavar="M", help="Folder, hub id or packaged name of a causal language model."
+    )
+    _output(parser)
+    return parser
+
+
+def _at_least_one(word: str) -> int:
     """A whole number above 0, as argparse reads it."""
     return _bounded(word, 1)
 
@@ -251,7 +289,7 @@ def _not_negative(word: str) -> int:
 
 def _bounded(word: str, low: int) -> int:
     try:
-        number = whole(word)
+        number = whole_number(word)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{word!r} is not a whole number.") from None
     if number < low:
@@ -316,7 +354,7 @@ def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
     return unknown_flag(name, known)
 
 
-def read_settings(path: str) -> Any:
+def _settings_in(path: str) -> Any:
     """What a settings.json holds, given as a file or as the folder of a run. UsageError if there is none."""
     from tightrope.runs.records import read_json
     from tightrope.runs.signed import unsigned
@@ -331,7 +369,7 @@ def read_settings(path: str) -> Any:
 
 def _values_of_file(command: str, path: str) -> Options:
     """The values in a settings file, names and types checked. UsageError for those of another command."""
-    data = read_settings(path)
+    data = _settings_in(path)
     fields = data if isinstance(data, dict) else {}
     other = next((name for name, field in OWN_FIELDS.items() if field in fields), command)
     if other != command:
@@ -339,7 +377,7 @@ def _values_of_file(command: str, path: str) -> Options:
             f"--settings {path} holds the settings of {other}, expected those of {command}. Give "
             f"settings.json of a run of {command}, or type: {PROGRAM} {other} --settings {path}"
         )
-    return KINDS[command].values_from_json(data, f"--settings {path}")
+    return SETTINGS_CLASSES[command].values_from_json(data, f"--settings {path}")
 
 
 def _refuse_code(command: str, path: str, name: str, value: Any) -> None:
@@ -354,3 +392,31 @@ def _refuse_code(command: str, path: str, name: str, value: Any) -> None:
             f"folder that is gone. Give it again: {PROGRAM} {command} --settings {shlex.quote(path)} "
             f"{flag}{retyped(value, word)}"
         )
+
+
+def import_env_module(given: Options) -> None:
+    """Import the module of --env-module, a name or a file of the user, so that it registers environments."""
+    name = given.get("env_module")
+    if name is None:
+        return
+
+    path = Path(name)
+    if path.suffix != ".py":
+        sys.path.insert(0, os.getcwd())
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not (name + ".").startswith(error.name + "."):
+                raise
+            raise UsageError(
+                f"--env-module {name}: there is no such module. Give a module or FILE.py."
+            ) from error
+        return
+    if not path.is_file():
+        raise UsageError(f"--env-module {name}: there is no such file.")
+    sys.path.insert(0, str(path.resolve().parent))
+    spec = importlib.util.spec_from_file_location(path.stem, path.resolve())
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)

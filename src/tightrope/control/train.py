@@ -207,7 +207,7 @@ class AgentLearner:
     def _keep(self, mean: float) -> None:
         """Save the policy as the best. If it cannot be written, the one before stays the best."""
         try:
-            with signals.whole():
+            with signals.uninterrupted():
                 self.agent.save(self.run.best)
         except CannotWrite as error:
             self.listeners.warn(

@@ -24,6 +24,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from tightrope.errors import TightropeError
 from tightrope.language.generation.distribution import CHUNK
 from tightrope.language.model.load import fused, pretrained, without_weights
 from tightrope.language.model.parts import Parts, parts
@@ -37,7 +38,7 @@ LOGIT_COPIES = 6  # [chunk, vocabulary] at once in token_statistics: p and log p
 DRAW_BYTES = 28  # per row and word while a token is drawn: logits twice, log p; p and its sum in float64
 
 
-class DoesNotFit(ValueError):
+class DoesNotFit(TightropeError, ValueError):
     """A job needs more memory than there is."""
 
 

@@ -1,1 +1,3 @@
-"""Every metric, declared once."""
+"""The declarations of all metrics."""
+
+__all__ = ["declare", "table"]

@@ -1,4 +1,4 @@
-"""How a metric is declared: `Metric`, and `metric` to write one down in a line."""
+"""How a metric is declared: `Metric`, and `metric`, its short form."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ Good = Literal["up", "down", "inside", "any"]
 class Metric:
     """One number of a run.
 
-    ``good`` says how to read it: ``up`` and ``down`` name the better direction, ``inside`` means that it
-    belongs between ``low`` and ``high``, ``any`` that it describes and does not judge. ``negative`` is True
-    where values below 0 are possible. ``low`` and ``high`` bound the healthy range; None where there is no
-    such bound.
+    ``good``: which values are good. ``up`` and ``down`` name the better direction, ``inside`` means between
+    ``low`` and ``high``, ``any`` that no value is better. ``negative`` is True if values below 0 are
+    possible. ``low`` and ``high`` bound the healthy range; None: no such bound.
     """
 
     name: str
@@ -28,7 +27,7 @@ class Metric:
 
     @property
     def healthy(self) -> str:
-        """The healthy range in words; an empty string where there is none."""
+        """The healthy range as text; an empty string if there is none."""
         if self.low is not None and self.high is not None:
             return f"{self.low:g} to {self.high:g}"
         if self.low is not None:
@@ -45,5 +44,5 @@ def metric(
     low: float | None = None,
     high: float | None = None,
 ) -> Metric:
-    """A `Metric` from positions, so that a table of them reads as a table."""
+    """A `Metric` from positional arguments, which keeps the tables short."""
     return Metric(name=name, unit=unit, good=good, doc=doc, negative=negative, low=low, high=high)

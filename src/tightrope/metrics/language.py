@@ -1,7 +1,7 @@
-"""The metrics that only the language story has; `runs.metrics` joins them with the others.
+"""The metrics of the language story; `metrics.table` adds them to the others.
 
-A name without an addition is a sum over the response, averaged over responses; a mean over tokens says
-``token_mean``. The two differ by the length of the responses, and are never given one name.
+A name without a suffix is a sum over the response, averaged over responses. A mean over tokens has
+``token_mean`` in its name. The two differ by the length of the responses, so they never share a name.
 """
 
 from __future__ import annotations

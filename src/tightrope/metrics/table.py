@@ -1,6 +1,4 @@
-"""Every metric, declared once: name, unit, sign, healthy range, meaning. What is not in the table cannot be
-logged.
-"""
+"""Every metric: name, unit, sign, healthy range, meaning. Only metrics in this table can be recorded."""
 
 from __future__ import annotations
 
@@ -213,8 +211,8 @@ def of_story(story: Literal["control", "language"]) -> list[Metric]:
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Raise ValueError for the first name that is neither in the table nor a word behind the prefix of a
-    family, with the nearest one that is.
+    """Raise ValueError for the first name that is neither in the table nor begins with the prefix of a
+    family. The message suggests the nearest declared name.
     """
     for name in names:
         if name not in METRICS and not any(str(name).startswith(p) and name != p for p in FAMILIES):

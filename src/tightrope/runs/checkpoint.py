@@ -1,10 +1,10 @@
-"""Checkpoints: folders of ``manifest.json``, ``state.json`` and ``*.safetensors``, whole or absent, never
+"""Checkpoints: folders of ``manifest.json``, ``state.json`` and ``*.safetensors``, complete or absent, never
 unpickled.
 
 A checkpoint is written under a name that starts with a dot, made durable, and renamed into place, so a crash
 at any moment leaves either no folder or a complete one. Reading trusts nothing: the manifest names every file
-with its size and SHA-256, and itself has to be the very text that its content gives; a folder that differs
-from its manifest in any way is refused.
+with its size and SHA-256, and must itself be exactly the text that is written for its content. A folder that
+differs from its manifest in any way is refused.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ import re
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from tightrope.runs import tensors as safetensors_file
+from tightrope.errors import TightropeError
 from tightrope.runs import versions
-from tightrope.runs.durable import present, whole, write_file
+from tightrope.runs.durable import atomic_folder, present, write_file
 from tightrope.runs.records import canonical, dumps, read_json
+from tightrope.runs.tensors import safetensors_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+_T = TypeVar("_T")
 FORMAT = "tightrope-checkpoint"
 VERSION = 2
 READS = 5  # of a folder that is replaced while it is read
@@ -34,12 +36,12 @@ _STEP_FOLDER = re.compile(r"step-(\d{12})")
 _ADVICE = "The checkpoint is damaged or was changed: use another one, or train again."
 
 
-class CheckpointError(ValueError):
-    """A checkpoint that cannot be trusted or found; the message names the file and what to do."""
+class CheckpointError(TightropeError, ValueError):
+    """A checkpoint that is damaged or missing; the message names the file and what to do."""
 
 
 def step_folder(checkpoints: Path, step: int) -> Path:
-    """Where the checkpoint of a step lies: ``checkpoints/step-000000060000``."""
+    """The folder of the checkpoint of a step: ``checkpoints/step-000000060000``."""
     return checkpoints / f"step-{step:012d}"
 
 
@@ -57,21 +59,20 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
     complete.
 
     ``tensors`` maps a file stem to its named tensors (``{"policy": {...}}`` becomes policy.safetensors),
-    dtypes kept. ``state`` is JSON; integers of any size are exact, a float that is not finite becomes null,
-    so what must come back to the bit belongs into ``tensors``. Whatever goes wrong, no visible folder is
-    left. Raises CheckpointError for a stem that is not a plain name, CannotWrite, which is an OSError, for
-    what the disk refuses.
+    dtypes kept. ``state`` is JSON: integers of any size are exact, a float that is not finite becomes null.
+    Store in ``tensors`` what must be restored exactly. After an error no visible folder is left. Raises
+    CheckpointError for a stem that is not a plain name, CannotWrite (an OSError) for errors of the disk.
     """
     folder = Path(folder)
     _refuse_to_replace(folder)
     for stem in tensors:
         if not _STEM.fullmatch(stem):
             raise CheckpointError(
-                f"{stem!r} is no file stem for a checkpoint. Use letters, digits, '-' and '_'."
+                f"{stem!r} is not a file stem for a checkpoint. Use letters, digits, '-' and '_'."
             )
-    with whole(folder) as temporary:
+    with atomic_folder(folder) as temporary:
         parts: dict[str, Any] = {"state.json": [(dumps(state, indent=2) + "\n").encode("utf-8")]}
-        parts |= {f"{stem}.safetensors": safetensors_file.content(group) for stem, group in tensors.items()}
+        parts |= {f"{stem}.safetensors": safetensors_bytes(group) for stem, group in tensors.items()}
         files = {}
         for name, content in parts.items():
             size, digest = write_file(temporary / name, content, sync=False)
@@ -82,32 +83,32 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
             "step": step_of(folder) if step_of(folder) >= 0 else None,
             "files": files,
             "versions": versions.known(),
-            "settings_sha256": fingerprint(state["settings"]) if "settings" in state else None,
+            "settings_sha256": json_sha256(state["settings"]) if "settings" in state else None,
         }
         write_file(temporary / "manifest.json", [_manifest_text(manifest)], sync=False)
     return folder
 
 
 def _manifest_text(manifest: dict[str, Any]) -> bytes:
-    """The one text of a manifest, the hash of its content in it."""
+    """The only valid text of a manifest, which includes the hash of its content."""
     bare = {name: value for name, value in manifest.items() if name != "sha256"}
-    return (dumps({**bare, "sha256": fingerprint(bare)}, indent=2) + "\n").encode("utf-8")
+    return (dumps({**bare, "sha256": json_sha256(bare)}, indent=2) + "\n").encode("utf-8")
 
 
-def fingerprint(value: Any) -> str:
+def json_sha256(value: Any) -> str:
     """The SHA-256 of the canonical JSON of a value."""
     return hashlib.sha256(canonical(value)).hexdigest()
 
 
 def _refuse_to_replace(folder: Path) -> None:
-    """CheckpointError unless the folder is free, empty, or holds a checkpoint and nothing beside it."""
+    """CheckpointError unless the folder is missing, empty, or holds a checkpoint and nothing else."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     try:
         read_manifest(folder)
     except (CheckpointError, OSError) as error:
         raise CheckpointError(
-            f"{folder} is there already and is no checkpoint of this library, so it is not replaced "
+            f"{folder} exists and is not a checkpoint of this library, so it is not replaced "
             f"({error}). Save under another name."
         ) from error
 
@@ -119,8 +120,8 @@ def load(folder: Path) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
     """Tensors (on the CPU) and state of a checkpoint, verified. Raises CheckpointError naming the file at
     fault.
 
-    A crash between the two renames of a replacement leaves the old checkpoint set aside; it is found and
-    used. One that is replaced while it is read is read again.
+    After a crash between the two renames of a replacement, the old checkpoint is found under its temporary
+    name. A checkpoint that is replaced while it is read is read again.
     """
     return _steadily(Path(folder), _load)
 
@@ -133,7 +134,7 @@ def _load(folder: Path) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
     for name, entry in read_manifest(folder)["files"].items():
         if name == "state.json":
             continue
-        # Hashed and parsed are the same bytes: a file changed in between cannot slip in.
+        # The hashed bytes are parsed, so that a file cannot change in between.
         content = _verified(folder / name, entry)
         try:
             tensors[name.removesuffix(".safetensors")] = parse(content)
@@ -145,7 +146,7 @@ def _load(folder: Path) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
 
 
 def load_state(folder: Path) -> dict[str, Any]:
-    """The verified ``state.json`` of a checkpoint alone: cheap, and without importing torch."""
+    """The verified ``state.json`` of a checkpoint, without its tensors: fast, and without torch."""
     return _steadily(Path(folder), _load_state)
 
 
@@ -173,25 +174,23 @@ def verify(folder: Path) -> None:
 
 @contextlib.contextmanager
 def understood(folder: Path) -> Iterator[None]:
-    """Inside, a state or tensors that are not what this library writes are a CheckpointError: a manifest
-    guards against damage, not against whoever writes one.
+    """Turns errors about a wrong state or wrong tensors into a CheckpointError: a manifest protects against
+    damage, but not against a file that someone wrote on purpose.
     """
     try:
         yield
-    except CheckpointError:
-        raise
     except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError) as error:
         kind = type(error)
-        if kind.__module__.startswith("tightrope.") or kind.__name__ == "OutOfMemoryError":
-            raise  # an environment's fault, or too little memory: not the checkpoint's
+        if isinstance(error, TightropeError) or kind.__name__ == "OutOfMemoryError":
+            raise  # a fault of an environment, or too little memory: not of the checkpoint
         reason = (str(error).strip().splitlines() or [""])[0]
         raise CheckpointError(
             f"{folder} does not hold what belongs there ({kind.__name__}: {reason}). {_ADVICE}"
         ) from error
 
 
-def _steadily(folder: Path, read: Callable[[Path], Any]) -> Any:
-    """What ``read`` gives of a folder, tried again as long as another folder has taken its place."""
+def _steadily(folder: Path, read: Callable[[Path], _T]) -> _T:
+    """The result of ``read`` for a folder; tried again if another folder replaced it meanwhile."""
     for left in reversed(range(READS)):
         before = _identity(folder)
         try:

@@ -1,6 +1,6 @@
-"""Files and folders that are whole or absent, also after a crash, and the error when they cannot be written.
+"""Files and folders that are complete or absent, also after a crash, and the error if they cannot be written.
 
-What is being written has a name that starts with `TEMPORARY`; it gets its own name when its bytes are on the
+A file or folder gets a temporary name that starts with `TEMPORARY`. It is renamed when its bytes are on the
 disk.
 """
 
@@ -16,10 +16,12 @@ import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from tightrope.errors import TightropeError
+
 TEMPORARY = ".saving-"
 ASIDE = ".replaced-"
 PRUNED = ".pruned-"
-BLOCK = 8 << 20  # hashed while it is in the processor's cache, written, then the next one
+BLOCK = 8 << 20  # bytes that are hashed while they are in the processor's cache, then written
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 _FULL = "Make room on the disk"
 _ADVICE = {
@@ -32,27 +34,27 @@ _ADVICE = {
 }
 
 
-class CannotWrite(OSError):
-    """Something that could not be written: the path, why, and what to do. What was there before is whole."""
+class CannotWrite(TightropeError, OSError):
+    """A path that could not be written, why, and what to do. What was saved before is intact."""
 
     def __init__(self, path: Path, cause: BaseException) -> None:
         number, reason = getattr(cause, "errno", None), getattr(cause, "strerror", None) or str(cause)
-        if number is None and (found := re.search(r"os error (\d+)", reason)):  # as safetensors words it
+        if number is None and (found := re.search(r"os error (\d+)", reason)):  # the text of safetensors
             number = int(found.group(1))
         super().__init__(number, reason, str(path))
         self.what = f"{path} cannot be written ({reason}). Nothing that was saved before is lost."
-        self.advice = _ADVICE.get(number or 0, "See to the disk")
+        self.advice = _ADVICE.get(number or 0, "Check the disk")
 
     def __str__(self) -> str:
         return (
-            f"{self.what} {self.advice} and try again; a run that has a checkpoint goes on with: "
+            f"{self.what} {self.advice} and try again; a run that has a checkpoint continues with: "
             "tightrope resume RUN"
         )
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Inside, what the system cannot write, on a full disk for one, is a CannotWrite that names ``path``."""
+    """Turns errors of the system, such as a full disk, into a CannotWrite that names ``path``."""
     from safetensors import SafetensorError
 
     try:
@@ -64,8 +66,8 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def write_file(path: Path, parts: Iterable[bytes | memoryview], *, sync: bool = True) -> tuple[int, str]:
-    """A new file: its size and SHA-256, computed while it is written. It is on the disk when this returns,
-    unless ``sync`` is False.
+    """Write a new file; returns its size and SHA-256, computed while it is written. It is on the disk when
+    this returns, unless ``sync`` is False.
     """
     digest, size = hashlib.sha256(), 0
     descriptor = os.open(path, _NEW, 0o666)
@@ -84,14 +86,14 @@ def write_file(path: Path, parts: Iterable[bytes | memoryview], *, sync: bool = 
 
 
 def write_all(descriptor: int, content: bytes | memoryview) -> None:
-    """Every byte: the system may take fewer than it is given."""
+    """Write every byte: one system call may write fewer than it is given."""
     rest = memoryview(content)
     while rest:
         rest = rest[os.write(descriptor, rest) :]
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Write one file so that a reader sees the old one or the new one whole, also after a crash."""
+    """Write one file so that a reader sees the complete old or the complete new one, also after a crash."""
     temporary = path.with_name(f"{TEMPORARY}{path.name}-{uuid.uuid4().hex[:8]}")
     try:
         write_file(temporary, [content])
@@ -104,11 +106,11 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 @contextlib.contextmanager
-def whole(folder: Path) -> Iterator[Path]:
-    """A new folder to fill; on leaving it takes the place of ``folder``, whole and durable.
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """A new folder to fill. At the end it replaces ``folder``, complete and durable.
 
-    Files in it are made durable when all are written: the first fsync then carries most of the others.
-    Whatever goes wrong, ``folder`` is as it was. Raises CannotWrite.
+    Its files are made durable after all are written: the first fsync then writes most of the others too.
+    After any error ``folder`` is as it was. Raises CannotWrite.
     """
     temporary = folder.with_name(f"{TEMPORARY}{folder.name}-{uuid.uuid4().hex[:8]}")
     with writing(folder):
@@ -135,7 +137,7 @@ def sync_tree(folder: Path) -> None:
 
 def sync_file(path: Path) -> None:
     """Make the bytes of a file durable."""
-    descriptor = os.open(path, os.O_RDWR)  # Windows makes only writable files durable
+    descriptor = os.open(path, os.O_RDWR)  # Windows syncs only files that are open for writing
     try:
         os.fsync(descriptor)
     finally:
@@ -143,8 +145,8 @@ def sync_file(path: Path) -> None:
 
 
 def put(temporary: Path, folder: Path) -> None:
-    """Rename into place. A folder cannot be renamed over a full one, so an old one steps aside first; until
-    the new one is there, `present` finds it.
+    """Rename ``temporary`` to ``folder``. A folder cannot replace one that is not empty, so the old one is
+    renamed first. Until the new one is in place, `present` finds the old one.
     """
     aside = folder.with_name(f"{ASIDE}{folder.name}")
     if folder.is_dir() and not any(folder.iterdir()):
@@ -165,13 +167,13 @@ def put(temporary: Path, folder: Path) -> None:
 
 
 def present(folder: Path) -> Path:
-    """The folder, or where it stepped aside when a crash cut its replacement off."""
+    """The folder, or the name that the old one was given if a crash interrupted its replacement."""
     aside = folder.with_name(f"{ASIDE}{folder.name}")
     return aside if not folder.exists() and aside.is_dir() else folder
 
 
 def remove(folder: Path) -> None:
-    """Delete a folder so that no reader finds half of it under its name."""
+    """Delete a folder so that no reader finds a part of it under its name."""
     pruned = folder.with_name(f"{PRUNED}{folder.name}")
     if pruned.exists():
         shutil.rmtree(pruned)
@@ -181,7 +183,7 @@ def remove(folder: Path) -> None:
 
 
 def remove_leftovers(parent: Path) -> None:
-    """Delete what a crash left of a save, and finish a replacement that it cut off. Only for the one process
+    """Delete what a crash left of a save, and finish an interrupted replacement. Only for the one process
     that writes there.
     """
     for path in sorted(parent.iterdir()) if parent.is_dir() else ():
@@ -192,7 +194,7 @@ def remove_leftovers(parent: Path) -> None:
 
 
 def make_folders(folder: Path) -> None:
-    """Make a folder and those above it, their names durable."""
+    """Create a folder and those above it, with durable names."""
     if not folder.is_dir():
         make_folders(folder.parent)
         with contextlib.suppress(FileExistsError):
@@ -201,7 +203,7 @@ def make_folders(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable, where the platform knows how (fsync of a directory)."""
+    """Make the names in a folder durable, if the platform can (fsync of a directory)."""
     if os.name == "nt":  # Windows cannot open a folder
         return
     descriptor = os.open(folder, os.O_RDONLY)

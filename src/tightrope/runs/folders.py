@@ -1,4 +1,4 @@
-"""Run folders by name: a fresh one, and the one that was meant."""
+"""Run folders by name: a new one, and the one that the user probably meant."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from tightrope.runs.lock import NAME
 
 
 def require_free(path: Path) -> None:
-    """ValueError unless a run may be made here: nothing is there, or nothing but a lock."""
+    """ValueError unless a run can be created here: the path is free, or a folder with only a lock in it."""
     inside = path.iterdir() if path.is_dir() else ()
     if (path.exists() and not path.is_dir()) or any(entry.name != NAME for entry in inside):
         raise ValueError(
             f"run_dir {path} exists and is not empty; a run is never overwritten. "
-            f"Give another --run-dir, delete the folder, or go on with: tightrope resume {path}"
+            f"Give another --run-dir, delete the folder, or continue with: tightrope resume {path}"
         )
 
 
 def fresh(parent: Path, name: str) -> Path:
-    """A new folder named after the present second; a number is added when it is taken."""
+    """A new folder named after the current second; a number is added if the name is taken."""
     stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
     for number in range(1, 1000):
         path = parent / (stem if number == 1 else f"{stem}-{number}")
@@ -33,7 +33,7 @@ def fresh(parent: Path, name: str) -> Path:
 
 
 def why_not(path: Path) -> str:
-    """Why a path is no run folder, and which near one is."""
+    """Why a path is not a run folder, and which similar one is."""
     reason = "it holds no settings.json." if path.is_dir() else "there is no such folder."
     inside = _runs_in(path)
     if inside:

@@ -15,11 +15,11 @@ from tightrope.runs.records import RECORDS
 if TYPE_CHECKING:
     from torch import Tensor
 
-LOOKS = 5  # at the list of checkpoints, when their writer deletes them meanwhile
+ATTEMPTS = 5  # to read the newest checkpoint while the writer deletes some
 
 
 class Checkpoint(NamedTuple):
-    """What was read: where it lay, its tensors (on the CPU) and its state."""
+    """A checkpoint that was read: its folder, its tensors (on the CPU) and its state."""
 
     folder: Path
     tensors: dict[str, dict[str, Tensor]]
@@ -27,7 +27,9 @@ class Checkpoint(NamedTuple):
 
 
 def steps_in(checkpoints: Path) -> list[Path]:
-    """The checkpoint folders of a run, the oldest first; valid or not. One that stepped aside counts."""
+    """The checkpoint folders of a run, valid or not, the oldest first; also one that was renamed for a
+    replacement.
+    """
     inside = checkpoints.iterdir() if checkpoints.is_dir() else ()
     found = {path.with_name(path.name.removeprefix(ASIDE)) for path in inside}
     return sorted((path for path in found if step_of(path) >= 0), key=step_of)
@@ -44,7 +46,7 @@ def valid(
     """
     checkpoints, why = Path(checkpoints), ""
     warn = warn or _warn
-    for _ in range(LOOKS):
+    for _ in range(ATTEMPTS):
         found, vanished = steps_in(checkpoints), False
         for folder in reversed(found):
             try:
@@ -74,7 +76,7 @@ def _warn(text: str) -> None:
 
 
 def marks_of(point: Checkpoint) -> dict[str, dict[str, Any]]:
-    """What a checkpoint counts on in the record files, by name. CheckpointError where it does not say."""
+    """The lengths of the record files at a checkpoint, by name. CheckpointError if they are missing."""
     marks = point.state.get("records")
     if not isinstance(marks, dict) or not all(map(_is_mark, marks.values())):
         raise CheckpointError(f"{point.folder / 'state.json'} does not say what had been recorded.")
@@ -88,10 +90,9 @@ def _is_mark(mark: Any) -> bool:
 
 def prune(checkpoints: Path, keep: int | None) -> list[Path]:
     """Delete all but the newest ``keep`` checkpoints (None: delete none) and the best of the others, the one
-    whose state has the highest ``merit``; returns what went.
+    whose state has the highest ``merit``; returns the deleted folders.
 
-    To be called when the newest one has been verified, so that a valid one is left whatever happened to the
-    others.
+    Call it after the newest one was verified, so that a valid one is left whatever happened to the others.
     """
     older = [] if keep is None else steps_in(checkpoints)[: -max(keep, 1)]
     if not older:

@@ -1,7 +1,7 @@
-"""One writer a run folder: a lock of the system's, and a note of who holds it.
+"""At most one writer for each run folder: a lock of the operating system, and a note of who holds it.
 
-The lock goes with the process, however it ends, so one that was killed never stands in the way; the note it
-leaves says that it was there.
+The system releases the lock when the process ends, also after a kill, so a dead process never blocks a run.
+The note that it leaves shows that it did not finish.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import weakref
 from pathlib import Path
 from typing import Any
 
+from tightrope.errors import TightropeError
 from tightrope.runs.durable import write_all, writing
 
 NAME = "writer.lock"
@@ -25,15 +26,15 @@ _HELD: weakref.WeakSet[WriterLock] = weakref.WeakSet()
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
-class RunInUse(RuntimeError):
-    """Another process, or another place in this one, is writing this run; the message names it."""
+class RunInUse(TightropeError, RuntimeError):
+    """Another process, or other code in this one, is writing this run; the message names it."""
 
 
 class WriterLock:
     """The right to write into a run folder, held until `release` or the end of the process.
 
-    ``left_by`` says in words who held it last and ended without giving it back; an empty string where nobody
-    did. Raises RunInUse where somebody holds it now, CannotWrite where no file can be made. On a file system
+    ``left_by`` describes the last holder that ended without releasing it; empty if there is none. Raises
+    RunInUse if another process holds it now, CannotWrite if the file cannot be created. On a file system
     without locks there is a warning instead.
     """
 
@@ -62,7 +63,7 @@ class WriterLock:
                     "Wait until it ends, or end it; evaluate, record, sample and load read at any time."
                 ) from error
             warnings.warn(
-                f"{folder} lies on a file system without locks ({error.strerror}): see to it that nothing "
+                f"{folder} is on a file system without locks ({error.strerror}): make sure that nothing "
                 "else writes there.",
                 stacklevel=4,
             )
@@ -77,18 +78,18 @@ class WriterLock:
         write_all(self._descriptor, json.dumps(here).encode() + b"\n")
 
     def release(self) -> None:
-        """Let another one write."""
+        """Let another process write."""
         if self._descriptor is not None:
             with contextlib.suppress(OSError):  # a disk that has become read-only keeps the note
                 os.ftruncate(self._descriptor, 0)
-            os.close(self._descriptor)  # with it goes the lock
+            os.close(self._descriptor)  # this releases the lock
             self._descriptor = None
 
     def __del__(self) -> None:
         self.release()
 
     def forget(self) -> None:
-        """Close the file alone. In a forked child: the lock is its parent's, and must not outlive it."""
+        """Only close the file: in a forked child, because the lock belongs to the parent."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
@@ -106,7 +107,7 @@ if sys.platform == "win32":
     import msvcrt
 
     def _lock(descriptor: int) -> None:
-        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # far behind the note, which others read
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # far after the note, which others read
         msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
 else:
     import fcntl
@@ -116,7 +117,7 @@ else:
 
 
 def _note(path: Path) -> dict[str, Any]:
-    """What the lock file says; empty where it says nothing that can be read."""
+    """The content of the lock file; empty if it cannot be read."""
     try:
         note = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

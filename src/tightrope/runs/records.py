@@ -17,13 +17,8 @@ from typing import Any
 
 from tightrope.runs.durable import BLOCK, replace_file, write_all, writing
 
-# changes.jsonl: settings that a listener has changed
-RECORDS = (
-    "metrics.jsonl",
-    "episodes.jsonl",
-    "samples.jsonl",
-    "changes.jsonl",
-)  # of a run: the files that grow
+# The files of a run that grow. changes.jsonl: settings that a listener has changed.
+RECORDS = ("metrics.jsonl", "episodes.jsonl", "samples.jsonl", "changes.jsonl")
 
 
 def plain(value: Any) -> Any:
@@ -75,8 +70,8 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file. Raises ValueError naming the file where it is not JSON (NaN literals are
-    not), and for a key that stands twice.
+    """The content of a JSON file. Raises ValueError naming the file if it is not JSON (NaN literals are not),
+    or if an object has a key twice.
     """
 
     def refuse(literal: str) -> None:
@@ -91,8 +86,8 @@ def read_json(path: Path) -> Any:
 
 
 def each_key_once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of its pairs, for the json module. ValueError for a key that stands twice: one reader takes
-    the first, another the last, so that what was checked need not be what is used.
+    """A dict of its pairs, for the json module. ValueError for a key that occurs twice: some readers take the
+    first and some the last, so the value that was checked might not be the one that is used.
     """
     found = dict(pairs)
     if len(found) < len(pairs):
@@ -102,21 +97,22 @@ def each_key_once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def retyped(name: Any, placeholder: str) -> str:
-    """A name out of a file as a word of a command to type: itself where it is a plain id, path or
-    FILE.py:function, else the placeholder, so that no file writes commands for a user to copy.
+    """A name from a file, as a word of a command to type. It stays if it is a plain id, path or
+    FILE.py:function. Otherwise the placeholder is returned, so that no file can write commands for a user to
+    copy.
     """
     plain = isinstance(name, str) and re.fullmatch(r"[\w.~/][\w.~/:-]*", name)
     return name if plain and (":" in name or ":" not in placeholder) else placeholder
 
 
 def printable(text: str) -> str:
-    """A text that may hold what a file says, without characters by which it could rule a terminal."""
+    """A text that may contain strings from a file, without characters that control a terminal."""
     return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 def refuse_links(folder: Path) -> None:
-    """ValueError for a link, a pipe or a device anywhere in a folder: who reads or writes there would be led
-    to any place of the machine.
+    """ValueError for a link, a pipe or a device anywhere in a folder: reads and writes could be redirected to
+    any place of the machine.
     """
     for parent, folders, names in os.walk(folder):
         for path in (Path(parent, name) for name in (*folders, *names)):
@@ -124,20 +120,20 @@ def refuse_links(folder: Path) -> None:
                 mode = path.lstat().st_mode
                 if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                     raise ValueError(
-                        f"{path} is a link or a device; expected files and folders alone, because a run is "
-                        "also written to. Put what it points to in its place, or delete it."
+                        f"{path} is a link or a device; expected only files and folders, because a run is "
+                        "also written to. Replace it by what it points to, or delete it."
                     )
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a .jsonl file, an empty list where there is no file.
+    """The objects of a .jsonl file; an empty list if there is no file.
 
-    A last line that was torn by a crash, or is being written, is left out; a torn line in the middle raises
-    ValueError with its number.
+    A last line that is incomplete, after a crash or while it is written, is left out. An incomplete line in
+    the middle raises ValueError with its number.
     """
     try:
         return _parsed(path)
-    except ValueError:  # a run that went on may have cut the file back while it was read
+    except ValueError:  # a resumed run may have shortened the file while it was read
         return _parsed(path)
 
 
@@ -154,7 +150,7 @@ def _parsed(path: Path) -> list[dict[str, Any]]:
             if not isinstance(row, dict):
                 raise ValueError("not an object")
         except (ValueError, RecursionError) as error:
-            if number == len(lines):  # no newline behind it: the writer was stopped in the middle
+            if number == len(lines):  # no newline after it: the writer was stopped in the middle
                 break
             raise ValueError(f"{path} line {number} is not a JSON object ({error}).") from error
         rows.append(row)
@@ -197,13 +193,13 @@ class Recorder:
             os.lseek(self._descriptor, 0, os.SEEK_END)
 
     def sync(self) -> dict[str, Any]:
-        """Make it durable; returns the mark of this moment, for `agrees` and `cut_back`."""
+        """Make it durable; returns the mark of this moment, for `disagreement` and `cut_back`."""
         with writing(self.path):
             os.fsync(self._descriptor)
         return {"bytes": self._size, "sha256": self._digest.hexdigest()}
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -213,7 +209,7 @@ class Recorder:
 
 
 def disagreement(path: Path, mark: dict[str, Any]) -> str:
-    """Why a file does not begin with what a mark of `Recorder.sync` counted; empty where it does."""
+    """Why a file does not begin with the bytes of a mark from `Recorder.sync`; empty if it does."""
     size = path.stat().st_size if path.exists() else 0
     if size < mark["bytes"]:
         return f"{path} has {size} bytes, the checkpoint counts on {mark['bytes']}"

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 class Run:
-    """The files of one run. Made by `create` or `open`; nothing is written before something is recorded.
+    """The files of one run, made by `create` or `open`.
 
-    ``settings`` is the resolved content of settings.json. Of a run there is one writer: what writes takes the
-    lock first (see `lock`). Readers may come at any time.
+    ``settings`` is the resolved content of settings.json. A run has at most one writer: methods that write
+    take the lock first (see `lock`). Reading is possible at any time.
     """
 
     def __init__(self, path: Path, settings: dict[str, Any]) -> None:
@@ -46,14 +46,14 @@ class Run:
         self._files: dict[str, Recorder] = {}
         self._lock: WriterLock | None = None
         self._costs: dict[str, float] = {}
-        self._new_name = False  # of a record file, not yet durable
+        self._new_name = False  # a record file was created and its name is not yet durable
 
     @classmethod
     def create(cls, run_dir: str | Path | None, settings: dict[str, Any], name: str) -> Run:
-        """A fresh run folder with settings.json in it.
+        """A new run folder with settings.json in it.
 
-        ``run_dir`` None: ``runs/<name>-<yyyymmdd-hhmmss>``. Nothing is ever overwritten: a folder that is
-        there and not empty raises ValueError before anything is written.
+        ``run_dir`` None: ``runs/<name>-<yyyymmdd-hhmmss>``. Nothing is ever overwritten: a folder that exists
+        and is not empty raises ValueError before anything is written.
         """
         with writing(Path("runs") if run_dir is None else Path(run_dir)):
             if run_dir is None:
@@ -63,17 +63,17 @@ class Run:
                 require_free(path)
                 durable.make_folders(path)
         run = cls(path, plain(settings)).lock()
-        require_free(path)  # nobody has taken it before the lock was ours
+        require_free(path)  # no other process took it before we had the lock
         write_json(path / "settings.json", signed(run.settings))
         return run
 
     @classmethod
     def open(cls, path: str | Path, *, own: bool = False) -> Run:
-        """An existing run folder. Raises ValueError where there is none, naming a near one, and for links
+        """An existing run folder. Raises ValueError if there is none, naming a similar one, and for links
         inside it.
 
         ``own``: for a caller that continues the run. The writer's lock is taken before anything is read, so
-        that no other writer changes what was read. Raises RunInUse where there is one, and ValueError when
+        that no other writer changes what was read. Raises RunInUse if there is one, and ValueError if
         settings.json is not as the run wrote it.
         """
         path = Path(path)
@@ -91,9 +91,9 @@ class Run:
         return run
 
     def lock(self) -> Run:
-        """Become the one writer, until `close` or the end of the process; nothing when it is already.
+        """Become the only writer, until `close` or the end of the process; no effect if it already is.
 
-        Raises RunInUse naming who writes now.
+        Raises RunInUse, which names the present writer.
         """
         if self._lock is None:
             self._lock = WriterLock(self.path)
@@ -101,7 +101,7 @@ class Run:
 
     @property
     def checkpoints(self) -> Path:
-        """Where the checkpoints lie, one folder a step; see `checkpoint_folder`."""
+        """The folder of the checkpoints, one folder per step; see `checkpoint_folder`."""
         return self.path / "checkpoints"
 
     @property
@@ -111,22 +111,23 @@ class Run:
 
     @property
     def videos(self) -> Path:
-        """Where recordings lie; made by whoever records."""
+        """The folder of recordings; made by `record_run`."""
         return self.path / "videos"
 
     def checkpoint_folder(self, step: int) -> Path:
-        """Where the checkpoint of this step belongs: ``checkpoints/step-000000060000``."""
+        """The folder of the checkpoint of this step: ``checkpoints/step-000000060000``."""
         return checkpoint.step_folder(self.checkpoints, step)
 
     def newest(self) -> Checkpoint:
-        """The newest valid checkpoint, read; for anybody at any time. Damaged ones are passed over with a
+        """Read the newest valid checkpoint, without the lock. Damaged ones are skipped with a
         warning. Raises CheckpointError.
         """
         return history.valid(self.checkpoints)
 
     def record(self, step: int, seconds: float, values: dict[str, float]) -> dict[str, float]:
-        """Append the metrics of one update, and what the checkpoint before it took; returns both. Every name
-        must be declared, floats that are not finite become null. Raises CannotWrite, as all that writes here.
+        """Append the metrics of one update, and the cost of the checkpoint before it; returns both. Every
+        name must be declared; floats that are not finite become null. Raises CannotWrite, like all writing
+        methods.
         """
         values, self._costs = {**values, **self._costs}, {}
         metrics.check_names(values)
@@ -158,15 +159,15 @@ class Run:
         return self._files[name]
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """The rows of metrics.jsonl so far; a line torn by a crash is left out."""
+        """The rows of metrics.jsonl so far; a line cut off by a crash is left out."""
         return read_lines(self.path / "metrics.jsonl")
 
     def read_episodes(self) -> list[dict[str, Any]]:
-        """The rows of episodes.jsonl so far; a line torn by a crash is left out."""
+        """The rows of episodes.jsonl so far; a line cut off by a crash is left out."""
         return read_lines(self.path / "episodes.jsonl")
 
     def read_changes(self) -> list[dict[str, Any]]:
-        """The rows of changes.jsonl so far; a line torn by a crash is left out."""
+        """The rows of changes.jsonl so far; a line cut off by a crash is left out."""
         return read_lines(self.path / "changes.jsonl")
 
     def save(
@@ -180,15 +181,15 @@ class Run:
         merit: float | None = None,
         final: bool = False,
     ) -> None:
-        """A checkpoint at ``step``; when it has been read back, all but the newest ``keep`` go, and the one
-        of the highest ``merit`` stays.
+        """Save a checkpoint at ``step`` and verify it. Then all but the newest ``keep`` are deleted, except
+        the one with the highest ``merit``.
 
-        What was recorded is on the disk before the checkpoint can be seen, which keeps its length. What the
-        disk refuses is said and training goes on, unless this is the ``final`` one, or asked for by somebody:
-        then CannotWrite is raised. ``settings``, ``records`` and ``merit`` are added to ``state``. A signal
-        waits for the end.
+        The record files are on the disk before the checkpoint is visible; it stores their lengths. If the
+        disk refuses to write, a warning is sent and training continues; for the ``final`` checkpoint
+        CannotWrite is raised. ``settings``, ``records`` and ``merit`` are added to ``state``. A signal takes
+        effect at the end.
         """
-        with signals.whole():
+        with signals.uninterrupted():
             self._save(step, tensors, state, keep=keep, warn=warn, merit=merit, final=final)
 
     def _save(
@@ -213,18 +214,18 @@ class Run:
         except CannotWrite as error:
             if final:
                 raise
-            warn(f"No checkpoint at step {step:,}: {error.what} {error.advice}. Training goes on.")
+            warn(f"No checkpoint at step {step:,}: {error.what} {error.advice}. Training continues.")
             return
         try:
             history.prune(self.checkpoints, keep)
         except OSError as error:
-            warn(f"An old checkpoint cannot be deleted: {error}. See to {self.checkpoints}.")
+            warn(f"An old checkpoint cannot be deleted: {error}. Check {self.checkpoints}.")
         size = sum(path.stat().st_size for path in folder.iterdir())
         seconds = time.perf_counter() - clock
         self._costs = {"time/checkpoint_seconds": seconds, "time/checkpoint_megabytes": size / 1e6}
 
     def _sync(self) -> dict[str, Any]:
-        """Make everything recorded durable; returns the marks of the files."""
+        """Make all records durable; returns the marks of the files."""
         there = [name for name in RECORDS if name in self._files or (self.path / name).exists()]
         marks = {name: self._recorder(name).sync() for name in there}
         if self._new_name:
@@ -244,9 +245,9 @@ class Run:
             durable.remove_leftovers(parent)
 
     def resume_point(self, warn: Callable[[str], None], info: Callable[[str], None]) -> Checkpoint:
-        """Where the run can go on: the newest checkpoint that is valid and counts on no more than the record
-        files hold. ``warn`` gets what was passed over and what has changed since, ``info`` who left the run
-        without an end. Raises CheckpointError where there is none.
+        """Where the run can continue: the newest checkpoint that is valid and needs no more rows than the
+        record files hold. ``warn`` gets what was passed over and what has changed since, ``info`` who left
+        the run without an end. Raises CheckpointError where there is none.
         """
         self.lock()
         assert self._lock is not None
@@ -255,12 +256,12 @@ class Run:
         self._put_aside_a_damaged_best(warn)
         point = history.valid(self.checkpoints, warn, self._check_records)
         manifest = checkpoint.read_manifest(durable.present(point.folder))
-        if changed := versions.differences(manifest.get("versions")):
-            warn(f"{changed} since the checkpoint: the run goes on, but its last bits may differ.")
+        if changed := versions.version_changes(manifest.get("versions")):
+            warn(f"{changed} since the checkpoint: the run continues, but its last bits may differ.")
         return point
 
     def _put_aside_a_damaged_best(self, warn: Callable[[str], None]) -> None:
-        """So that it can be saved again: what is no checkpoint is never replaced."""
+        """Rename it so that it can be saved again: `checkpoint.save` replaces only valid checkpoints."""
         if not durable.present(self.best).is_dir():
             return
         try:
@@ -273,15 +274,16 @@ class Run:
         for name, mark in marks_of(point).items():
             if wrong := disagreement(self.path / name, mark):
                 raise CheckpointError(
-                    f"{wrong}. Put the file back as it was. {point.folder} itself is whole: tightrope.load "
+                    f"{wrong}. Restore the file. {point.folder} itself is intact: tightrope.load "
                     "and evaluate read it."
                 )
 
     def rewind(self, point: Checkpoint | None) -> None:
-        """Before going on from ``point``, or from the beginning: forget what was recorded after it, and half-
-        written saves. Newer checkpoints, which cannot be used, get a name that begins with ``unusable-``.
+        """Prepare to continue from ``point`` (None: from the beginning): remove the rows recorded after it,
+        and incomplete saves. Newer checkpoints, which cannot be used, get a name that begins with
+        ``unusable-``.
 
-        Without this a resumed run would list the updates between checkpoint and crash twice.
+        Otherwise a resumed run would list the updates between the checkpoint and the crash twice.
         """
         self.lock()
         self._close_files()
@@ -298,19 +300,19 @@ class Run:
             sync_folder(self.path)
 
     def update_settings(self, settings: dict[str, Any]) -> None:
-        """Replace settings.json: a resumed run may go on under another budget."""
+        """Replace settings.json: a resumed run may have another budget."""
         self.lock()
         self.settings = plain(settings)
         write_json(self.path / "settings.json", signed(self.settings))
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Write summary.json, the sign of a run that came to its end, and close the files."""
+        """Write summary.json, which marks a complete run, and close the files."""
         self.lock()
         write_json(self.path / "summary.json", summary)
         self.close()
 
     def close(self) -> None:
-        """Close what is open and let others write; recording again opens it again."""
+        """Close the files and release the lock; recording again reopens them."""
         self._close_files()
         if self._lock is not None:
             self._lock.release()

@@ -1,7 +1,7 @@
-"""SIGINT and SIGTERM: a run stops at once, but for a save under way, which is finished first.
+"""SIGINT and SIGTERM: a run stops at once; a save that has begun is finished first.
 
-Nothing is saved because of a signal: checkpoints lie where the settings put them, so a stopped and resumed
-run ends exactly like an uninterrupted one. A second signal does not wait for the save either.
+A signal causes no save. Checkpoints are written only where the settings put them, so a run that was
+stopped and resumed ends exactly like one that was not. A second signal does not wait for the save.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from types import FrameType
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked the run to stop; ``code`` is the exit code that says so: 130 or 143."""
+    """A signal asked the run to stop. ``code`` is the exit code of the command: 130 or 143."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -22,12 +22,12 @@ class Stopped(KeyboardInterrupt):
 
 
 class _Answer:
-    """What this process does about a signal; signals belong to the process, and so does this."""
+    """How this process handles signals: one object a process, because signals go to processes."""
 
     def __init__(self) -> None:
         self.active = False
-        self.asked: int | None = None  # the signal that came
-        self.saves = 0  # how many saves are inside each other
+        self.asked: int | None = None  # the number of the signal that came
+        self.saves = 0  # nested calls of `uninterrupted`
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         first, self.asked = self.asked is None, number
@@ -40,10 +40,11 @@ _answer = _Answer()
 
 @contextlib.contextmanager
 def stoppable() -> Iterator[None]:
-    """Inside, SIGINT and SIGTERM raise `Stopped`, in `whole` at its end; a second one raises it at once.
+    """Inside, SIGINT and SIGTERM raise `Stopped`: at once, or at the end of `uninterrupted`. A second signal
+    always raises it at once.
 
-    Only the main thread may handle signals: in another one nothing changes, and neither inside another
-    `stoppable`.
+    Only the main thread can handle signals. In another thread, or inside another `stoppable`, nothing
+    changes.
     """
     if _answer.active or threading.current_thread() is not threading.main_thread():
         yield
@@ -59,18 +60,18 @@ def stoppable() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def whole() -> Iterator[None]:
-    """Around a save: a signal that comes inside is answered when the save is complete."""
-    check()
+def uninterrupted() -> Iterator[None]:
+    """Around a save: a signal that comes inside takes effect when the save is complete."""
+    raise_if_stopped()
     _answer.saves += 1
     try:
         yield
     finally:
         _answer.saves -= 1
-    check()
+    raise_if_stopped()
 
 
-def check() -> None:
-    """Raise `Stopped` when a signal has come that someone's code has swallowed, or that came in `whole`."""
+def raise_if_stopped() -> None:
+    """Raise `Stopped` for a signal that came in `uninterrupted`, or whose exception some code has caught."""
     if _answer.active and _answer.asked is not None and not _answer.saves:
         raise Stopped(_answer.asked)

@@ -1,8 +1,8 @@
 """Named tensors as the bytes of a safetensors file, one tensor at a time.
 
-The library's own writer wants every tensor copied into memory of its own, and hides from the caller when it
-writes what. This one hands out bytes that are hashed as they are written. The format: the length of the
-header (8 bytes, little end first), the header as JSON, padded to a multiple of 8, the tensors.
+The writer of the safetensors library copies every tensor first, and the caller cannot hash the bytes while
+they are written. This one yields the bytes. The format: the length of the header (8 bytes, little-endian),
+the header as JSON, padded to a multiple of 8, the tensors.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _NAMES = {
 }
 
 
-def content(tensors: dict[str, Tensor]) -> Iterator[bytes | memoryview]:
-    """The bytes of a safetensors file of these tensors. ValueError for a dtype that it cannot hold."""
+def safetensors_bytes(tensors: dict[str, Tensor]) -> Iterator[bytes | memoryview]:
+    """The bytes of a safetensors file of these tensors. ValueError for a dtype without a name there."""
     import torch
 
-    ordered = sorted(tensors, key=lambda name: (-tensors[name].itemsize, name))  # each stands aligned
+    ordered = sorted(tensors, key=lambda name: (-tensors[name].itemsize, name))  # so that each is aligned
     header, end = {}, 0
     for name in ordered:
         tensor, begin = tensors[name], end

@@ -1,4 +1,4 @@
-"""What the bits of a run depend on besides its settings: library versions, the processor's instructions."""
+"""What the exact results depend on besides the settings: library versions, the processor's instructions."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import platform
 import sys
 from typing import Any
 
-LIBRARIES = ("torch", "numpy", "numba", "gymnasium", "transformers")
+VERSIONED = ("torch", "numpy", "numba", "gymnasium", "transformers")
 
 
 def known() -> dict[str, str]:
-    """Name -> version of Python, of this library, the processor and the libraries that are in use."""
+    """Name -> version of Python, of this library, the processor and the imported libraries."""
     from importlib import metadata
 
     try:
@@ -22,11 +22,11 @@ def known() -> dict[str, str]:
         import torch
 
         found["processor"] += f" {torch.backends.cpu.get_cpu_capability()}"
-    return found | {name: str(sys.modules[name].__version__) for name in LIBRARIES if name in sys.modules}
+    return found | {name: str(sys.modules[name].__version__) for name in VERSIONED if name in sys.modules}
 
 
-def differences(saved: Any) -> str:
-    """What has changed since ``saved``, an earlier answer of `known`, in words; empty when nothing has."""
+def version_changes(saved: Any) -> str:
+    """What has changed since ``saved``, an earlier result of `known`, as text; empty if nothing has."""
     saved, now = saved if isinstance(saved, dict) else {}, known()
     changed = [name for name in now if name in saved and saved[name] != now[name]]
     return ", ".join(f"{name} {saved[name]} -> {now[name]}" for name in changed)

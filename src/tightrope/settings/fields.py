@@ -1,6 +1,6 @@
-"""How a setting is declared: default, help text, range and type. The only reader of their annotations.
+"""How a setting is declared: default, help text, range and type.
 
-The command line, the checks and the docs all read the declaration.
+The command line, the checks and the docs read the declaration. Only this file interprets annotations.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def setting(
 
 
 def fixed(value: Any) -> Any:
-    """A field of a base class that has one value here: written to settings.json, never given."""
+    """A field of a base class with a fixed value here: written to settings.json, but not an option."""
     return dataclasses.field(default=value, init=False)
 
 
@@ -48,7 +48,7 @@ def of_update_rule(rules: Mapping[str, type]) -> Any:
 
 
 def range_text(metadata: Mapping[str, Any]) -> str:
-    """The range of a field in words: ``0 < x <= 1``, ``a | b``, or an empty string when anything goes."""
+    """The range of a field as text: ``0 < x <= 1``, ``a | b``; empty if every value is allowed."""
     if metadata["choices"]:
         return " | ".join(metadata["choices"])
     above, at_least, at_most = (metadata[name] for name in ("above", "at_least", "at_most"))
@@ -64,7 +64,7 @@ class Kind(NamedTuple):
     optional: bool
 
     def __str__(self) -> str:
-        """In words, for errors."""
+        """As text, for errors."""
         name = "whole numbers in a tuple or list" if self.type is tuple else self.type.__name__
         return f"{name} or None" if self.optional else name
 
@@ -83,9 +83,9 @@ def _kind(hint: Any) -> Kind:
 
 
 def typed(name: str, value: Any, kind: Kind) -> Any:
-    """``value`` as its field holds it: a list as a tuple, a whole number as a float where one is expected.
+    """``value`` as its field holds it: a list as a tuple, a whole number as a float if one is expected.
 
-    Raises ValueError for a value of another kind. The settings of an update rule are let through.
+    Raises ValueError for a value of another kind. The settings of an update rule are returned as they are.
     """
     if value is None and kind.optional:
         return None
@@ -98,7 +98,7 @@ def typed(name: str, value: Any, kind: Kind) -> Any:
     raise ValueError(f"{name} is {value!r} ({type(value).__name__}); expected {kind}.")
 
 
-def check(settings: Any) -> None:
+def validate(settings: Any) -> None:
     """Raise ValueError naming the first field of a wrong kind or outside its declared range."""
     kind: type = type(settings)
     for field in dataclasses.fields(settings):

@@ -1,4 +1,4 @@
-"""Other libraries' names for the settings; the only file that uses them."""
+"""The names that other libraries use for the settings; no other file uses them."""
 
 # Names of stable-baselines3, CleanRL, TRL, RLlib and rl_games, and what the same thing is called here.
 PEER_NAMES = {

@@ -1,4 +1,4 @@
-"""What every settings class can do: check itself, change values, be written to settings.json and read."""
+"""The base of every settings class: checks, changed values, and settings.json."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from tightrope.settings.fields import check, kinds, typed
+from tightrope.settings.fields import kinds, typed, validate
 from tightrope.settings.peer_names import PEER_NAMES
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Frozen values, checked where they are made. A field ``update`` holds those of the update rule, whose
+    """Frozen values that are checked on creation. A field ``update`` holds those of the update rule, whose
     names are used as if they were fields of this class.
     """
 
     def __post_init__(self) -> None:
         """Check every field: its kind, its range, and the class of ``update``."""
-        check(self)
+        validate(self)
         rule = rule_of(type(self), getattr(self, "algorithm", None))
         update = getattr(self, "update", None)
         if rule is not None and not isinstance(update, rule):
@@ -107,7 +107,7 @@ def _read(kind: type, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _require_known(owner: str, values: Collection[str], known: Collection[str]) -> None:
-    """ValueError for a name that is no setting, with the one that was probably meant."""
+    """ValueError for a name that is not a setting, with the setting that was probably meant."""
     for name in values:
         if name not in known:
             near = [PEER_NAMES.get(name, ""), *difflib.get_close_matches(name, known, n=1)]

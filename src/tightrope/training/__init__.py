@@ -1,1 +1,3 @@
-"""The one training loop and what drives it."""
+"""The training loop of both stories. `events` is public, for listeners; the rest is internal."""
+
+__all__ = ["events"]

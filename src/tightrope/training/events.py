@@ -1,4 +1,4 @@
-"""What a run reports while it trains, and what a listener may ask for.
+"""What a run reports while it trains, and what a listener can request.
 
 A listener is a callable that takes one event. A run has a list of them: the terminal display and TensorBoard
 are two. Steps are environment steps (control), responses (align) or optimiser steps (sft, reward).
@@ -11,6 +11,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from tightrope.runs.records import printable
+
+__all__ = [
+    "Change", "Evaluated", "Event", "Finished", "Level", "Listener", "Listeners", "Message", "Request",
+    "Samples", "Started", "Stop", "Updated",
+]  # fmt: skip
 
 Level = Literal["info", "warning"]
 
@@ -72,7 +77,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Stop:
-    """Asks the loop to end the run after this update: it is saved and summed up as at its end."""
+    """Asks the loop to end the run after this update: it is saved and summarised as at its end."""
 
     reason: str = ""
 

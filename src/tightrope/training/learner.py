@@ -64,7 +64,7 @@ class Learner(Protocol):
 
     @property
     def complete(self) -> bool:
-        """Whether no update is left."""
+        """Whether all updates are done."""
 
     @property
     def merit(self) -> float | None:
@@ -86,13 +86,13 @@ class Learner(Protocol):
         """Everything that `restore` needs, as tensors and JSON."""
 
     def restore(self, point: Checkpoint) -> None:
-        """Put back a checkpoint. ValueError when it is not one of this run."""
+        """Restore a checkpoint. ValueError if it does not belong to this run."""
 
     def roll_back(self, point: Checkpoint) -> None:
-        """Put back a checkpoint with other random numbers from there on, and count it."""
+        """Restore a checkpoint, use other random numbers from there on, and count the rollback."""
 
     def finish(self, run: Run) -> dict[str, Any]:
-        """Write what the run leaves behind besides checkpoints; returns the summary."""
+        """Write the final files besides checkpoints; returns the summary."""
 
 
 def change(learner: Learner, setting: str, value: Any) -> None:
@@ -108,10 +108,10 @@ def change(learner: Learner, setting: str, value: Any) -> None:
 
 
 def crosses(before: float, after: float, total: float, fraction: float | None) -> bool:
-    """Whether ``fraction * total``, ``2 fraction * total``, ... has a member in (before, after].
+    """Whether one of ``fraction * total``, ``2 fraction * total``, ... lies in (before, after].
 
-    Several at once count as one; ``fraction`` None: there are no points. The total itself is one where the
-    fraction divides it. Steps that miss a point by a rounding error of their share have reached it.
+    Several at once count as one. ``fraction`` None: there are no points. The total itself is a point if the
+    fraction divides it. A point that is missed only by a rounding error counts as reached.
     """
     if fraction is None:
         return False

@@ -35,9 +35,9 @@ class _Loop:
             self._start()
             stop = self._requests()
             for update in () if stop else self._updates():
-                signals.check()
+                signals.raise_if_stopped()
                 self._record(update)
-                # before the save, so that a resumed run knows what was changed at its checkpoint
+                # before the save, so that a resumed run knows the changes made before its checkpoint
                 if self._requests():
                     break
                 if update.on_grid and not learner.complete:  # the end has its own save
@@ -93,7 +93,7 @@ class _Loop:
         )
 
     def _record(self, update: Update) -> None:
-        """Evaluate where it is due, write the rows, tell the listeners."""
+        """Evaluate if it is due, write the rows, send the events."""
         learner, run, step = self.learner, self.run, update.step
         metrics = update.metrics
         if learner.rollbacks:
@@ -116,7 +116,7 @@ class _Loop:
             self.listeners(Evaluated(step, found))
 
     def _requests(self) -> bool:
-        """Do what listeners have asked for; returns whether one of them asked to stop."""
+        """Carry out the requests of the listeners; returns whether one of them asked to stop."""
         asked, self.listeners.requests = self.listeners.requests, []
         stop = False
         for request in asked:

@@ -1,4 +1,4 @@
-"""Every tensor that training changes, out of the model and back."""
+"""Save and restore every tensor that training changes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ def tensors_of(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimi
 
 
 @torch.no_grad()
-def put_back(tensors: Tensors, parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> None:
+def restore_tensors(
+    tensors: Tensors, parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer
+) -> None:
     """Copy what `tensors_of` gave into the same parameters and their optimiser."""
     for index, parameter in enumerate(parameters):
         parameter.copy_(tensors["trained"][f"{index:05d}"])

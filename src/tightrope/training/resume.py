@@ -10,7 +10,7 @@ from tightrope.training.learner import Learner, change
 
 
 def newest_point(run: Run, listeners: Listeners) -> Checkpoint | None:
-    """The newest checkpoint that can be used; None where the run has saved nothing yet."""
+    """The newest usable checkpoint; None if the run has saved nothing yet."""
     if steps_in(run.checkpoints):
         return run.resume_point(listeners.warn, listeners.info)
     if run.read_metrics():
@@ -19,8 +19,8 @@ def newest_point(run: Run, listeners: Listeners) -> Checkpoint | None:
 
 
 def continue_from(learner: Learner, run: Run, point: Checkpoint | None) -> None:
-    """Bring the run folder to where the learner is: at ``point`` (None: at the beginning). Rows behind it go,
-    and settings.json holds the present settings.
+    """Bring the run folder to the position of the learner, ``point`` (None: the beginning). Later rows are
+    removed, and settings.json gets the present settings.
     """
     run.rewind(point)
     run.update_settings(learner.settings.to_json())
@@ -28,7 +28,7 @@ def continue_from(learner: Learner, run: Run, point: Checkpoint | None) -> None:
 
 
 def restore_changes(learner: Learner, run: Run) -> None:
-    """The changes of settings that the run has recorded, and no others."""
+    """Apply exactly the changes of settings that the run has recorded."""
     learner.changes.clear()
     with understood(run.path):
         for row in run.read_changes():

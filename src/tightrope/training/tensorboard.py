@@ -10,7 +10,7 @@ from tightrope.training.events import Event, Finished, Started, Updated
 
 
 class TensorBoard:
-    """Raises ValueError where the package is missing."""
+    """Raises ValueError if the package is missing."""
 
     def __init__(self) -> None:
         self._make: Any = require_tensorboard(True)
@@ -30,14 +30,14 @@ class TensorBoard:
 
 
 def require_tensorboard(wanted: bool) -> Any:
-    """TensorBoard's writer class, where it is wanted. ValueError where the package is missing."""
+    """TensorBoard's writer class if it is wanted, else None. ValueError if the package is missing."""
     if not wanted:
         return None
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise ValueError(
-            "TensorBoard files are asked for, and the package tensorboard is not installed. "
+            "TensorBoard files are requested, but the package tensorboard is not installed. "
             "Install it with: pip install 'tightrope[tensorboard]', or leave --tensorboard out."
         ) from error
     return SummaryWriter

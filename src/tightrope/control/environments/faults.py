@@ -18,13 +18,15 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from tightrope.errors import TightropeError
+
 FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
 LONGEST_PAUSE = 2.0
-Outcome = TypeVar("Outcome")
+_T = TypeVar("_T")
 
 
 @dataclass(eq=False, repr=False)
-class EnvironmentFault(RuntimeError):
+class EnvironmentFault(TightropeError, RuntimeError):
     """An environment raised, hung or broke Gymnasium's API, or its process died.
 
     ``index``: which environment (-1: unknown). ``step``: since all were reset. ``worker``: its process (0:
@@ -49,7 +51,7 @@ class EnvironmentFault(RuntimeError):
         return {name: value for name, value in dataclasses.asdict(self).items() if name != "lost"}
 
 
-class ApiBreak(Exception):
+class ApiBreak(TightropeError):
     """An environment returned what Gymnasium's API does not allow; becomes an EnvironmentFault.
 
     ``index``: the row of a vector environment that did (-1: all, or unknown).
@@ -97,9 +99,9 @@ class Restarts:
     def until_it_works(
         self,
         fault: EnvironmentFault,
-        attempt: Callable[[], Outcome],
+        attempt: Callable[[], _T],
         explain: Callable[[BaseException], EnvironmentFault],
-    ) -> Outcome:
+    ) -> _T:
         """Return ``attempt()``, called again after each fault in it.
 
         ``explain`` turns what ``attempt`` raised into a fault, or raises. Raises the last fault when the

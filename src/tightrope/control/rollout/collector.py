@@ -16,9 +16,10 @@ from tightrope.control.environments.faults import action_text, circumstances
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.spaces import Array, Inputs
+from tightrope.errors import TightropeError
 
 
-class BadNumbers(ValueError):
+class BadNumbers(TightropeError, ValueError):
     """An environment returned a NaN or an infinity; nothing was learned from it."""
 
 

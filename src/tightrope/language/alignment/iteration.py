@@ -55,7 +55,7 @@ from tightrope.runs.records import figures
 from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Update, crosses
-from tightrope.training.parameters import Tensors, put_back, tensors_of
+from tightrope.training.parameters import Tensors, restore_tensors, tensors_of
 
 # what a checkpoint holds of a trainer as it is, and how it is read back
 SAVED: dict[str, Callable[[Any], Any]] = {
@@ -230,7 +230,7 @@ class Trainer:
                 "the run started with, or start a new run."
             )
         with understood(folder):
-            put_back(tensors, self.roles.parameters(), self.optimiser)
+            restore_tensors(tensors, self.roles.parameters(), self.optimiser)
             for name, read in SAVED.items():
                 setattr(self, name, read(state[name]))
             self.rollbacks = int(state.get("rollbacks", 0))

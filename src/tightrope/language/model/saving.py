@@ -17,7 +17,7 @@ from tightrope.language.model.lora import (
     merged_state,
 )
 from tightrope.language.model.parts import parts
-from tightrope.runs.durable import whole, writing
+from tightrope.runs.durable import atomic_folder, writing
 
 
 def save_adapter(
@@ -79,7 +79,7 @@ def save_model(model: Any, tokenizer: Any, run: Path, adapter: str | None, base_
     """
     write_model(model, tokenizer, run / "model", adapter)
     if adapter is not None:
-        with whole(run / "adapter") as folder:
+        with atomic_folder(run / "adapter") as folder:
             save_adapter(model, adapter, folder, base_model=base_model)
 
 
@@ -88,6 +88,6 @@ def write_model(model: Any, tokenizer: Any, folder: Path, adapter: str | None) -
     Raises CannotWrite.
     """
     state = {key: tensor.cpu() for key, tensor in merged_state(model, adapter).items()}
-    with whole(folder) as temporary:
+    with atomic_folder(folder) as temporary:
         model.save_pretrained(temporary, state_dict=state)
         tokenizer.save_pretrained(temporary)

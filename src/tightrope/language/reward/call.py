@@ -25,13 +25,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tightrope.errors import TightropeError
+
 Text = str | list[dict[str, Any]]
 RewardFunction = Callable[..., Any]
 FaultKind = Literal["exception", "length", "type", "not finite", "timeout", "none"]
 LARGEST = 1e30  # above it a score, or a sum of weighted ones, would be infinite in float32
 
 
-class RewardError(ValueError):
+class RewardError(TightropeError, ValueError):
     """A reward function cannot be used as it is; the message names it and what to do."""
 
 
@@ -48,7 +50,7 @@ class Fault:
     text: str
 
 
-class NoScores(Exception):
+class NoScores(TightropeError):
     """What a function returned is not a list of scores; the message follows the function's name."""
 
     def __init__(self, kind: FaultKind, text: str) -> None:
@@ -213,7 +215,7 @@ class _Call:
         for kind, samples in _read_scores(back, weight, found.scores).items():
             first = back[samples[0]]
             shown = f"the {type(first).__name__} {str(first)[:60]!r}" if kind == "type" else f"{first}"
-            place = place_of(samples, completions)
+            place = samples_text(samples, completions)
             fault(kind, samples, f"returned {shown} for {place}, expected a finite number or None.")
         found.metrics = {
             f"logged/{name}": math.fsum(values) / len(values) for name, values in self._metrics.items()
@@ -269,7 +271,7 @@ def describe_error(error: BaseException) -> str:
     return f"{text} (line {line} of {Path(frames[0].filename).name})"
 
 
-def place_of(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:
+def samples_text(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:
     """Samples in words, counted from 0: ``sample 3 of 64 and 5 more (response 'The film ...')``."""
     shown = repr(str(completions[samples[0]])[:60])
     more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""

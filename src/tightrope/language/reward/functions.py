@@ -34,7 +34,7 @@ from tightrope.language.reward.call import (
     Text,
     as_number,
     describe_error,
-    place_of,
+    samples_text,
 )
 
 # What is a mistake in the code raises by default; what the data or the world does masks the samples.
@@ -169,7 +169,7 @@ class Rewards:
                 found.extras[f"{column} ({name})" if column in found.extras else column] = entries
         nobody = np.flatnonzero(~applies & ~broken)
         if len(nobody):
-            text = f"No reward function applies to {place_of(nobody, completions)}: all returned None."
+            text = f"No reward function applies to {samples_text(nobody, completions)}: all returned None."
             found.faults.append(Fault("", "none", tuple(nobody.tolist()), text))
         valid = applies & ~broken
         return dataclasses.replace(found, total=np.where(valid, total, np.nan), valid=valid)

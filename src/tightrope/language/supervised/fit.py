@@ -29,7 +29,7 @@ from tightrope.runs.records import figures
 from tightrope.runs.run import Run
 from tightrope.settings.fields import scheduled
 from tightrope.training.learner import Update, crosses
-from tightrope.training.parameters import Tensors, put_back, tensors_of
+from tightrope.training.parameters import Tensors, restore_tensors, tensors_of
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class SupervisedLearner:
             step, before = int(state["step"]), state["items"]
             newest = figures(state["newest"])
             if before == items:
-                put_back(tensors, self.parameters, self.optimiser)
+                restore_tensors(tensors, self.parameters, self.optimiser)
             self.step = step
             self.seen = int(state["seen"])
             self.seconds = float(state["seconds"])

@@ -14,7 +14,7 @@ from tightrope.language.model.load import weights_fingerprint, without_weights
 from tightrope.language.model.saving import save_adapter
 from tightrope.language.reward.model import SHIFT
 from tightrope.language.supervised.prepare import Loaded
-from tightrope.runs.durable import whole
+from tightrope.runs.durable import atomic_folder
 
 
 def reward_skeleton(loaded: Loaded) -> Any:
@@ -52,12 +52,12 @@ def save_reward(
     state = {name: tensor.cpu() for name, tensor in {**state, "score.weight": head}.items()}
     skeleton.load_state_dict(state, strict=True, assign=True)
     setattr(skeleton.config, SHIFT, shift)
-    with whole(path / "model") as folder:
+    with atomic_folder(path / "model") as folder:
         skeleton.save_pretrained(folder)
         loaded.tokenizer.save_pretrained(folder)
         (folder / "README.md").write_text(card(shift, loaded.source, final), encoding="utf-8")
     if loaded.adapter is not None:
-        with whole(path / "adapter") as folder:
+        with atomic_folder(path / "adapter") as folder:
             save_adapter(loaded.model, loaded.adapter, folder, base_model=loaded.source, score=head)
             # the head with its shift, for alignment
             shifted = {"score.weight": head.cpu(), "shift": torch.tensor(shift, dtype=torch.float64)}

@@ -1,0 +1,211 @@
+"""The commands that train, in both stories: train, sft, reward, align, and resume."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shlex
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TextIO
+
+from tightrope.cli import display
+from tightrope.cli.display import Display
+from tightrope.cli.flags import UsageError
+from tightrope.cli.options import (
+    OWN_FIELDS,
+    PROGRAM,
+    SETTINGS_CLASSES,
+    Options,
+    dry_run,
+    import_env_module,
+    print_json,
+    resume_parser,
+    training_options,
+)
+from tightrope.runs import checkpoint, signals
+from tightrope.runs.run import Run
+from tightrope.settings.values import Settings
+
+VIEWS = {"train": display.CONTROL, "sft": display.SFT, "reward": display.REWARD, "align": display.ALIGN}
+# settings that must be given, and how they are typed
+REQUIRED = {
+    "sft": {"data": "--data FILE.jsonl"},
+    "reward": {"data": "--data FILE.jsonl"},
+    "align": {"data": "--data PROMPTS.jsonl", "reward": "--reward length"},
+}
+START, RESUME = 0, 1  # places in `_functions`
+Training = Callable[..., Any]
+
+
+def train(command: str, words: list[str]) -> int:
+    """``tightrope train ENV``, ``sft``, ``reward``, ``align``: resolve the settings, train, print the end."""
+    given, values = training_options(command, words)
+    if command == "train":
+        env = values.pop("env", None)
+        if env is None:
+            raise UsageError("Which task? Give a Gymnasium id: tightrope train CartPole-v1")
+        import_env_module(given)
+        from tightrope.control.resolve import resolve
+
+        settings: Settings = resolve(env, values.pop("algorithm", "ppo"), values)
+    else:
+        settings = SETTINGS_CLASSES[command]().with_values(**values)
+    if dry_run(settings, given):
+        return 0
+    for name, example in REQUIRED.get(command, {}).items():
+        if not getattr(settings, name):
+            raise UsageError(f"--{name} is missing. For example: {PROGRAM} {command} {example}")
+    return _watched(command, given, START, settings, run_dir=given.get("run_dir"))
+
+
+def resume(words: list[str]) -> int:
+    """``tightrope resume RUN``: continue from the newest checkpoint."""
+    given = resume_parser().read(words)
+    try:
+        settings = Run.open(given["run"]).settings
+    except ValueError:  # who writes there now comes first: RunInUse
+        with Run.open(given["run"], own=True) as run:
+            settings = run.settings
+    command = next((name for name in ("train", "sft", "reward") if OWN_FIELDS[name] in settings), "align")
+    total = given.get("total_steps")
+    if command == "train":
+        import_env_module(given)
+        values = {"total_steps": total, "env": given.get("env")}
+    elif command == "align":
+        values = {"total_episodes": total, "prompts": given.get("data")}
+        values |= {name: given.get(name) for name in ("reward", "gold")}
+    else:
+        for option in ("total_steps", "reward"):
+            if option in given:
+                raise UsageError(
+                    f"{given['run']} is a run of {command}, which has no --{option.replace('_', '-')}. Leave "
+                    "it out: the settings of the run hold how long it trains, and on what."
+                )
+        values = {"data": given.get("data")}
+    return _watched(command, given, RESUME, given["run"], **values)
+
+
+def _functions(command: str) -> tuple[Training, Training]:
+    """What starts a run of a command, and what resumes it. torch is imported here."""
+    if command == "train":
+        from tightrope.control.train import resume as resume_policy
+        from tightrope.control.train import train as train_policy
+
+        return train_policy, resume_policy
+    require_transformers()
+    if command == "sft":
+        from tightrope.language.supervised.sft import resume_sft, train_sft
+
+        return train_sft, resume_sft
+    if command == "reward":
+        from tightrope.language.supervised.preferences import resume_reward, train_reward
+
+        return train_reward, resume_reward
+    from tightrope.language.alignment.align import align, resume_align
+
+    return align, resume_align
+
+
+def require_transformers() -> None:
+    """UsageError where the package of the language story is missing."""
+    if importlib.util.find_spec("transformers") is None:
+        raise UsageError(
+            "The language story needs transformers. Install it with: pip install 'tightrope[language]'"
+        )
+
+
+def _watched(command: str, given: Options, which: int, *args: Any, **values: Any) -> int:
+    """START or RESUME a run with the display, and print its end; returns the exit code."""
+    as_json, quiet = bool(given.get("json")), bool(given.get("quiet"))
+    stream = sys.stderr if as_json else sys.stdout
+    live = not as_json and display.can_live(sys.stdout, dict(os.environ))
+    view = VIEWS[command]
+    shown = Display(view, stream, quiet=quiet, live=live)
+    try:
+        with signals.stoppable(), shown:
+            ended = _functions(command)[which](*args, **values, listeners=[shown])
+    except KeyboardInterrupt as error:
+        again = _command("resume", shown.run, given) if shown.run else ""
+        print(farewell(error, shown.run, shown.step, view.counted, again), file=sys.stderr)
+        return error.code if isinstance(error, signals.Stopped) else 130
+    summary = ended if isinstance(ended, dict) else ended.summary
+    if as_json:
+        print_json({**summary, "run_dir": shown.run})
+    else:
+        _print_end(command, summary, str(shown.run), given, stream)
+    return 0
+
+
+def farewell(error: BaseException, run: str | None, step: int, counted: str, command: str) -> str:
+    """The message for a ``run`` (None: not begun) that was stopped at ``step``: its newest valid checkpoint,
+    what will be repeated, and the ``command`` that resumes it. ``counted``: steps, responses.
+    """
+    by = f" by {error}" if isinstance(error, signals.Stopped) else ""
+    if run is None:
+        return f"Stopped{by} before the run began."
+    text = f"Stopped{by} at {counted.removesuffix('s')} {step:,}. "
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # `resume` reports damaged checkpoints
+            folder = Run.open(run).newest().folder
+    except ValueError:
+        text += f"There is no checkpoint yet: all {step:,} {counted} will be repeated."
+    else:
+        lost = max(0, step - checkpoint.step_of(folder))
+        text += f"The newest valid checkpoint is {folder}; {lost:,} {counted} since then will be repeated."
+    return f"{text} Go on with:\n  {command}"
+
+
+def _command(name: str, run: str, given: Options) -> str:
+    """A command to type about a run, with the code of the user that it needs."""
+    words = [PROGRAM, name, run]
+    if "env_module" in given:
+        words += ["--env-module", given["env_module"]]
+    if ":" in given.get("env", ""):
+        words += ["--env", given["env"]]
+    if name == "resume":
+        settings = Run.open(run).settings
+        for judge in ("reward", "gold"):
+            if ".py:" in str(settings.get(judge)):
+                words += [f"--{judge}", settings[judge]]
+    return shlex.join(words)
+
+
+def _print_end(command: str, summary: dict[str, Any], run: str, given: Options, stream: TextIO) -> None:
+    """The final figures, where the run lies, and what to type next."""
+    quiet, final = given.get("quiet"), summary.get("final") or {}
+    if command == "train":
+        _print_returns(summary, final, None if quiet else run, stream)
+    elif not quiet:
+        for name, value in final.items():
+            if isinstance(value, int | float):
+                print(f"{name:<32} {value:.4g}", file=stream)
+    print(f"run          {run}", file=stream)
+    if quiet:
+        return
+    follows = {"train": ("evaluate", "record"), "align": ("sample",)}.get(command, ())
+    for title, name in zip(("next", ""), follows, strict=False):
+        print(f"{title:<12} {_command(name, run, given)}", file=stream)
+    if command != "train":
+        print(f"model        {Path(run) / 'model'}", file=stream)
+
+
+def _print_returns(summary: dict[str, Any], final: dict[str, Any], run: str | None, stream: TextIO) -> None:
+    """The learning curve of a control ``run`` (None: no curve), its final evaluation and its speed."""
+    if run is not None:
+        points = [(row["step"], row.get("rollout/ep_rew_mean")) for row in Run.open(run).read_metrics()]
+        if lines := display.curve([(step, value) for step, value in points if value is not None]):
+            print("\nreturn of the training episodes", *lines, sep="\n", file=stream)
+        print(file=stream)
+    mean, deviation, count = (final.get(f"eval/{name}") for name in ("mean_reward", "std_reward", "episodes"))
+    steps, seconds = summary.get("steps"), summary.get("wall_seconds")
+    if mean is not None:
+        spread = f" ± {display.number(deviation)}" if deviation is not None else ""
+        over = f" over {count:.0f} episodes" if count else ""
+        print(f"evaluation   mean return {display.number(mean)}{spread}{over}", file=stream)
+    if steps is not None and seconds:
+        speed = f"{steps / seconds:,.0f} steps/s"
+        print(f"training     {steps:,} steps in {display.clock(seconds)} ({speed})", file=stream)
