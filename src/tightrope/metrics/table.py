@@ -136,7 +136,7 @@ _TABLE = (
         "nats",
         "down",
         "Largest |log ratio| before the first gradient step: 0 up to rounding: what is sampled is trained. "
-        "Range of the control story; language: up to 0.0001 in float32, 0.5 in bfloat16.",
+        "Range of the control story; language: up to 0.0001 in float32, 1 in bfloat16.",
         low=0.0,
         high=1e-5,
     ),
