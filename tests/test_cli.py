@@ -1,6 +1,4 @@
-"""The command line: every setting is a documented flag, every mistake an answer and exit code 2, stdout is
-clean.
-"""
+"""Command line: every setting is a documented flag, mistakes get advice and exit code 2, stdout is clean."""
 
 from __future__ import annotations
 
@@ -450,7 +448,7 @@ def fake_training(train: Any) -> None:
 
 
 def a_run(folder: Path, stop_at: int | None = None) -> Any:
-    """A training function that reports 100 updates as the real one does, without learning anything."""
+    """A training function that reports 100 updates like the real one, without learning anything."""
     from tightrope.runs.run import Run
 
     def train(settings: TrainSettings, run_dir: str | None, listeners: Any) -> dict[str, Any]:
@@ -573,7 +571,7 @@ def test_help_is_quick_and_needs_no_heavy_package(words: list[str]) -> None:
     seconds = time.perf_counter() - begin
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines()[-1] == "heavy: []"
-    assert seconds < 1.5  # 0.1 s on a quiet machine; the promise is 0.5
+    assert seconds < 1.5  # 0.1 s on an idle machine; the promise is 0.5
 
 
 def test_python_dash_m_is_the_same() -> None:

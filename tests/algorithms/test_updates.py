@@ -1,4 +1,4 @@
-"""The update rules: what one step is, what several epochs add, and what stops them."""
+"""The update rules: a single step, several epochs, and the stops."""
 
 import copy
 import dataclasses
@@ -122,7 +122,7 @@ def test_a_batch_of_which_no_step_counts_is_refused(rule, settings, columns):
 
 @pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
 def test_a_row_of_which_no_step_counts_changes_nothing(rule, settings):
-    """Also where it would be a minibatch or a part of its own, whose mean is over nothing."""
+    """Even if it would form its own minibatch or part, with a mean over nothing."""
     batch = make_batch(TinyModel(), rows=6, columns=3)
     kept = torch.tensor([0, 2, 3, 5])
     mask = batch.mask.clone()
@@ -200,7 +200,7 @@ def test_a_nan_gradient_takes_no_step_and_says_so():
 
 
 def test_the_fused_adam_skips_a_refused_step_by_itself():
-    """What an accelerator relies on: found_inf leaves weights and moments as they are."""
+    """Accelerators rely on it: found_inf leaves weights and moments unchanged."""
     parameter = torch.nn.Parameter(torch.ones(3))
     optimiser = torch.optim.Adam([parameter], fused=True)
     parameter.grad = torch.full((3,), 2.0)
@@ -252,7 +252,7 @@ def test_extra_loss_joins_the_loss_and_its_metrics():
 @pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
 @pytest.mark.parametrize("micro", [None, 1, 5, 24])
 def test_extra_loss_is_told_the_count_of_the_whole_minibatch(rule, settings, micro):
-    """With it a loss that is a sum over steps has the scale of the rest, and micro-batches change nothing."""
+    """It gives a summed loss the scale of the other terms, so that micro-batches change nothing."""
     batch = make_batch(TinyModel(), rows=24, columns=3, masked=0.4)
     counts = []
 

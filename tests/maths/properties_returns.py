@@ -1,4 +1,4 @@
-"""What returns and advantages must fulfil: functions of (maths, case), see properties.py."""
+"""Properties of returns and advantages: functions of (maths, case), see properties.py."""
 
 import math
 from types import ModuleType
@@ -55,7 +55,7 @@ def every_row_may_have_a_lambda_of_its_own(maths: ModuleType, c: Case) -> None:
 
 
 def lambda_1_is_monte_carlo(maths: ModuleType, c: Case) -> None:
-    """The values cancel between one TD error and the next, and the discounted rewards are left."""
+    """The values cancel between neighbouring TD errors; the discounted rewards remain."""
     following = maths.returns.next_values(c.values, c.last_values, c.ended, c.final_values)
     advantages = maths.returns.gae(c.rewards, c.values, following, c.terminated, c.ended, c.gamma, 1.0)
     bootstrap = torch.where(c.terminated, 0.0, following)
@@ -86,7 +86,7 @@ def without_bootstrap_the_future_is_0(maths: ModuleType, c: Case) -> None:
 
 
 def episodes_know_nothing_of_each_other(maths: ModuleType, c: Case) -> None:
-    """Cut a row where it has ended: each part alone gives what it gave together."""
+    """Cut a row where it has ended: each part gives the same result as in the whole row."""
     whole = gae_of(maths, c)
     returns = maths.returns.discounted_returns(c.rewards, c.ended, c.gamma, c.final_values)
     for row, t in c.ended.nonzero().tolist():
@@ -120,7 +120,7 @@ def rows_may_be_permuted_and_padded(maths: ModuleType, c: Case) -> None:
 
 
 def nan_behind_a_cut_changes_nothing(maths: ModuleType, c: Case) -> None:
-    """Neither a value nor a gradient, of GAE and of the returns."""
+    """Neither values nor gradients change, for GAE and the returns."""
 
     def gae(rewards: Tensor, values: Tensor, following: Tensor) -> Tensor:
         return maths.returns.gae(
