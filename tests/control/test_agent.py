@@ -1,4 +1,4 @@
-"""The Python face: learn, iterate, predict, value, save, load, warm start."""
+"""The Python interface: learn, iterate, predict, value, save, load, warm start."""
 
 import gymnasium as gym
 import numpy as np
@@ -119,7 +119,7 @@ def test_a_saved_agent_of_one_engine_goes_on_with_the_other(tmp_path):
 
 
 class Renamed(gym.ObservationWrapper):
-    """CartPole under another name with other numbers, for a warm start."""
+    """CartPole under another name with other parameters, for a warm start."""
 
     def observation(self, observation):
         return observation * 1.0
@@ -217,7 +217,7 @@ def test_images_through_the_cnn():
 
 
 class Nested(gym.Env):
-    """Every kind of observation at once; the Discrete leaf tells the answer."""
+    """Every kind of observation at once; the Discrete leaf is the answer."""
 
     observation_space = spaces.Dict(
         {

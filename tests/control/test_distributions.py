@@ -1,4 +1,4 @@
-"""Densities are densities, and what is sampled has the density that is claimed."""
+"""Densities are valid, and samples follow the stated density."""
 
 import math
 
@@ -110,7 +110,7 @@ def test_frequencies_follow_the_probabilities():
 
 
 def test_entropies_are_those_of_the_maths_to_the_bit():
-    """Of every kind of component, with masked choices, under a deviation for all rows and one for each."""
+    """Every kind of component, with masked choices, and a shared or a per-row deviation."""
     space = spaces.Tuple((spaces.Discrete(5), spaces.MultiBinary(3), spaces.Box(-1, 1, (4,), np.float32)))
     layout, generator = action_layout(space), torch.Generator().manual_seed(0)
     parameters = torch.randn(6, 12, generator=generator)

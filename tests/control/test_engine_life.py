@@ -1,4 +1,4 @@
-"""What an engine leaves behind, and how another one takes over."""
+"""The end of an engine, and the switch to another one."""
 
 import pytest
 import threadpoolctl

@@ -53,7 +53,7 @@ def test_a_vector_environment_of_ones_own_in_every_mode(mode):
         ("tightrope_tests/Chain-v0", "auto", False),
         ("tightrope_tests/Chain-v0", "serial", False),
         ("tightrope_tests/Chain-v0", "workers", False),
-        ("tightrope_tests/VectorChain-v0", "vector", False),  # SAME_STEP is asked for where it is offered
+        ("tightrope_tests/VectorChain-v0", "vector", False),  # SAME_STEP is requested if it is offered
         ("tightrope_tests/NextStepChain-v0", "vector", True),
     ],
 )
@@ -143,7 +143,7 @@ def test_a_reset_mask_that_is_ignored_is_noticed():
         actions[::2] = 1
         with pytest.raises(EnvironmentFault, match=r"also changed environments .*Use autoreset"):
             for t in range(200):
-                actions[0] = t % 2  # balances for longer than the others
+                actions[0] = t % 2  # balances longer than the others
                 environments.step(actions)
 
 

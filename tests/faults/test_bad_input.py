@@ -1,4 +1,4 @@
-"""Bad input is named: what was seen, what was expected, what to do; exit code 2; weights untouched."""
+"""Errors for bad input state the value, the expectation and the remedy; exit code 2; weights unchanged."""
 
 import json
 
@@ -17,7 +17,7 @@ SMALL = dict(num_envs=2, num_steps=16, minibatch_size=16, num_epochs=1, seed=0)
 
 
 class Faulty(gym.Env):
-    """CartPole-like shapes; goes wrong at a given step."""
+    """CartPole-like shapes; fails at a given step."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = spaces.Discrete(2)
@@ -156,7 +156,7 @@ def test_risky_settings_are_trained_as_asked_with_a_warning(flags, words, capsys
 
 
 class Late(Faulty):
-    """Goes wrong only in the copy that was seeded with 3."""
+    """Fails only in the copy that was seeded with 3."""
 
     def reset(self, *, seed=None, options=None):
         if seed is not None:
@@ -172,7 +172,7 @@ class Late(Faulty):
     ("at", "last", "what"), [(20, True, "final observation"), (16, False, "observation")]
 )
 def test_the_right_environment_and_step_are_named(at, last, what):
-    """Also for a true final observation, and for the one after a rollout's last column."""
+    """Also for a true final observation, and for the observation after a rollout's last column."""
     agent = tightrope.PPO(
         lambda: Late("nan", at=at, last=last),
         vector_backend="serial",
@@ -210,7 +210,7 @@ def test_save_never_replaces_what_is_no_checkpoint(tmp_path):
 
 
 class MethodMask(Faulty):
-    """Forbids action 0 by a method alone."""
+    """Forbids action 0 only by a method."""
 
     def __init__(self):
         super().__init__("none")

@@ -1,4 +1,4 @@
-"""Prompts and rewards that cannot be: named with exit code 2, or masked and counted; never a wrong number."""
+"""Invalid prompts and rewards: named with exit code 2, or masked and counted; never a wrong number."""
 
 import json
 import time
@@ -97,7 +97,7 @@ def test_a_mistake_exits_with_2_and_says_what_to_do(place, tmp_path, capsys, row
     assert run(place, tmp_path, rows, reward, *more) == 2
     error = capsys.readouterr().err
     assert all(word in error for word in words) and "Traceback" not in error, error
-    assert "on_error" not in error  # no option of the command line
+    assert "on_error" not in error  # not an option of the command line
     assert time.monotonic() - begin < 20
 
 
@@ -127,7 +127,7 @@ def test_prompts_over_their_length_lose_their_beginning_and_are_counted(place, t
 
 
 class Rows:
-    """What datasets.Dataset offers: no list, no mapping; it yields dicts and knows its columns."""
+    """The interface of datasets.Dataset: not a list or mapping; yields dicts and has column names."""
 
     def __init__(self, rows):
         self.rows, self.column_names = rows, list(rows[0])

@@ -1,5 +1,5 @@
-"""A disk that refuses while a run trains: the run goes on without a checkpoint in the middle, and never
-without its last one or its records. Both stories, and the command line.
+"""A disk error during training: a run continues without a checkpoint in the middle, but never without its
+last one or its records. Control, language, and the command line.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def test_a_checkpoint_that_fails_in_the_middle_is_said_and_training_goes_on(
     bare = [
         [{k: v for k, v in row.items() if k[:4] not in ("seco", "time")} for row in each] for each in rows
     ]
-    assert bare[0] == bare[1]  # a checkpoint that is not written changes no bit
+    assert bare[0] == bare[1]  # a missing checkpoint changes no bit
 
 
 @EVERY

@@ -189,7 +189,7 @@ def test_a_rollout_whose_gradients_do_not_fit_goes_on_without_keeping_them(folde
 
 
 def test_a_pass_that_failed_for_memory_is_held_by_nothing(folder, monkeypatch):
-    """Its graph, that of the rollout's pass, is gone before the minibatch is done again in halves."""
+    """The graph of the rollout's pass is freed before the minibatch is repeated in halves."""
     from tightrope.language.alignment import iteration as module
 
     made, graphs, alive = trainer(folder, total_episodes=8, kl="exact-split"), [], []

@@ -1,4 +1,4 @@
-"""Faults that a run recovers from do not cost it its exact resume: what they count lies in the checkpoint."""
+"""A run that recovered from faults still resumes exactly: the checkpoint contains their counts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tightrope.training.events import Event, Updated
 
 
 class Brittle(Walk):
-    """Breaks about once in 40 steps, at places that are a function of the bits."""
+    """Fails about once in 40 steps, at steps that depend on the bits of the run."""
 
     def step(self, action: int) -> Any:
         found = super().step(action)
@@ -32,7 +32,7 @@ class Brittle(Walk):
 
 
 class Sealed(Brittle):
-    """The same without a state to give."""
+    """The same without a state to save."""
 
     get_state = set_state = None  # type: ignore[assignment]
 
@@ -74,7 +74,7 @@ def poison_control(patch: Any) -> None:
 
 
 def test_rollbacks_of_a_control_run(tmp_path, monkeypatch):
-    """Killed behind the first one, of which no checkpoint knows yet, and behind one that does."""
+    """Killed after the first one, before any checkpoint records it, and after one that is recorded."""
     poison_control(monkeypatch)
     settings = settings_for("CartPole-v1", engine="torch", max_rollbacks=2)
     train.train(settings, run_dir=tmp_path / "whole")

@@ -1,4 +1,4 @@
-"""Back to the newest checkpoint after a NaN: bounded, counted, on other random numbers, in both stories."""
+"""Rollback to the newest checkpoint after a NaN: bounded, counted, with new random numbers, for all runs."""
 
 import json
 
@@ -19,7 +19,7 @@ CONTROL = {
 
 
 def poison(monkeypatch, times):
-    """An advantage of NaN in the fifth update and the ones in its place after going back."""
+    """An advantage of NaN in the fifth update and in its repetitions after a rollback."""
     from tightrope.control import agent as module
 
     whole, calls, seen = module.to_batch, [0, 0], []
@@ -31,7 +31,7 @@ def poison(monkeypatch, times):
             calls[1] += 1
             seen.append(rollout.actions.copy())
             batch.advantages[0, 0] = torch.nan
-            calls[0] = 4  # the run goes back to the checkpoint of the fourth
+            calls[0] = 4  # the run returns to the checkpoint of the fourth
         return batch
 
     monkeypatch.setattr(module, "to_batch", poisoned)

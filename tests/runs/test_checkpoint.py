@@ -1,4 +1,4 @@
-"""A checkpoint is whole or absent, comes back to the bit, and any damage is named and refused."""
+"""A checkpoint is complete or absent, loads bit for bit, and any damage is named and refused."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def truncate(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
-def rewrite_manifest(**changes: object):  # a manifest that agrees with the folder in everything but these
+def rewrite_manifest(**changes: object):  # a manifest that matches the folder except for these
     def damage(folder: Path) -> None:
         path = folder / "manifest.json"
         path.write_bytes(checkpoint._manifest_text({**json.loads(path.read_text()), **changes}))
@@ -90,7 +90,7 @@ def rewrite_manifest(**changes: object):  # a manifest that agrees with the fold
 
 
 def rewrite_plain(folder: Path, **changes: object) -> None:
-    """A manifest that is changed and keeps the hash it had."""
+    """An edited manifest with its old hash."""
     path = folder / "manifest.json"
     manifest = {**json.loads(path.read_text()), **changes}
     path.write_text(json.dumps({k: v for k, v in manifest.items() if v is not None}, indent=2) + "\n")
@@ -280,7 +280,7 @@ DTYPES = [
 
 
 def test_every_reader_of_safetensors_reads_ours(tmp_path: Path) -> None:
-    """The same tensors as the library's own writer, of every dtype and shape, views and empty ones too."""
+    """The same tensors as the safetensors writer, for every dtype and shape, with views and empty ones."""
     random = torch.Generator().manual_seed(0)
     wanted = {}
     for dtype in DTYPES:

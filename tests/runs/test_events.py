@@ -1,4 +1,4 @@
-"""The events of every command, and what listeners can ask for."""
+"""The events of every command, and the requests of listeners."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_what_a_run_sends(run: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_both_displays_know_a_warning_by_its_level(quiet: bool, capsys: pytest.CaptureFixture[str]) -> None:
-    """The text of a fact may begin with any word; that of a warning need not."""
+    """The text of an information line may begin with any word; a warning's need not."""
     import sys
 
     shown = display.choose(sys.stdout, quiet=quiet, live=False), Display(ALIGN, "x", sys.stdout, quiet=quiet)

@@ -90,7 +90,7 @@ LANGUAGE = [
 
 
 def test_a_metric_that_is_never_logged_is_not_declared() -> None:
-    """Gold scores are those of held-out prompts, eval/gold."""
+    """Gold scores belong to held-out prompts, eval/gold."""
     assert "objective/gold" not in METRICS
 
 
