@@ -1,5 +1,5 @@
-"""Lives of whole commands under an audit hook: what runs is installed or was named by the user, and what is
-unpickled falls under one of the two exceptions of the design.
+"""Whole commands under an audit hook: all executed code is installed or named by the user, and all unpickling
+falls under one of the two exceptions of the design.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def language(tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 
 def check_lives(found: dict) -> None:
-    """Every command did its work and ran nothing else; only those that lack a name were refused."""
+    """Every command did its work and ran nothing else; only those without a name were refused."""
     for name, result in found["commands"].items():
         check_safe(result, megabytes=4000)
         assert result["code"] == (2 if "unnamed" in name else 0), (name, result["text"])

@@ -1,6 +1,4 @@
-"""From responses to a batch: values of the right state, scores at the right token, numbers that say what they
-are called.
-"""
+"""From responses to a batch: values of the right state, scores at the right token, correct metrics."""
 
 import dataclasses
 import math
@@ -31,7 +29,7 @@ def folder(tmp_path_factory):
 
 
 def experienced(present, **micro):
-    """Roles that have been trained a little, and what they sampled."""
+    """Slightly trained roles, and their samples."""
     present = dataclasses.replace(present, update=dataclasses.replace(present.update, **micro))
     roles = fresh(present)
     shake(roles)
@@ -69,7 +67,7 @@ def test_a_value_is_the_critics_of_the_text_before_the_token(folder, critic, lay
 
 
 def test_responses_of_different_lengths_have_their_score_at_their_own_end(folder):
-    """Rewards by hand, advantages as brute-force sums, with a critic that says something."""
+    """Rewards by hand, advantages as brute-force sums, with a non-trivial critic."""
     roles, experience = experienced(settings(folder))
     rewards, _ = rewards_of(experience, SCORES, roles.settings, 0.05)
     batch = to_batch(experience, rewards, EVERY, roles.settings)
@@ -96,7 +94,7 @@ def test_looking_at_responses_in_parts_changes_nothing(folder, micro):
 
 
 def poisoned(experience):
-    """NaN in every number behind the end of a response."""
+    """NaN in every number after the end of a response."""
     mask = experience.responses.mask
     names = ("logp", "ref_logp", "entropy", "exact", "values")
     dirty = {name: torch.where(mask, getattr(experience, name), torch.nan) for name in names}
@@ -124,7 +122,7 @@ def test_nan_behind_a_response_reaches_no_reward_advantage_or_metric(folder, val
 
 
 def test_a_response_that_ended_is_terminal_where_cut_ones_are_bootstrapped(folder):
-    """With V = 0.7 everywhere and no reward the last advantage is -0.7, or 0 where the critic goes on."""
+    """With V = 0.7 everywhere and no reward, the last advantage is -0.7, or 0 if the critic bootstraps."""
     ended = torch.tensor([True, False] * 3)
     for truncation, cut in (("terminal", -0.7), ("bootstrap", 0.0)):
         present = settings(folder, truncation=truncation)
@@ -139,7 +137,7 @@ def test_a_response_that_ended_is_terminal_where_cut_ones_are_bootstrapped(folde
 
 
 def test_tokens_of_which_the_policy_is_certain_count(folder):
-    """Their log-probability is 0: what counts is said by the mask, never by a number."""
+    """Their log-probability is 0: only the mask decides which tokens count, never a number."""
     roles, experience = experienced(settings(folder, top_k=1))
     mask = experience.responses.mask
     assert (experience.responses.logp[mask] == 0).all() and (experience.logp[mask] == 0).all()
@@ -150,7 +148,7 @@ def test_tokens_of_which_the_policy_is_certain_count(folder):
 
 
 def test_every_stop_of_the_generation_settings_ends_a_response_and_pays_no_penalty(folder):
-    """The penalty is subtracted from the score, which goes on telling responses apart."""
+    """The penalty is subtracted from the score, which still distinguishes responses."""
     roles, experience = experienced(settings(folder, missing_eos_penalty=1.5, max_new_tokens=3))
     assert roles.eos == STOPS
     responses, rows = experience.responses, torch.arange(6)
@@ -165,7 +163,7 @@ def test_every_stop_of_the_generation_settings_ends_a_response_and_pays_no_penal
 def test_whitened_rewards_are_divided_by_the_deviation_of_what_counts_and_keep_their_mean(folder):
     _, experience = experienced(settings(folder))
     mask, scores = experience.responses.mask, scores_of(1, 2, math.nan, 4, -1, 3)
-    experience.ref_logp[2] -= 50.0  # a response that does not count has no say in the scale
+    experience.ref_logp[2] -= 50.0  # a masked response does not affect the scale
     plain, one = rewards_of(experience, scores, settings(folder), 0.5)
     found, scale = rewards_of(experience, scores, settings(folder, whiten_rewards=True), 0.5)
     counting = mask & torch.from_numpy(scores.valid)[:, None]
@@ -195,7 +193,7 @@ def test_every_metric_of_a_rollout_by_hand():
     rewards = torch.tensor([[-0.1, 1.0, 0.0], [5.0, 5.0, 5.0], [0.5, 0.0, 0.0]])
     share = torch.tensor([[-0.1, -0.2, nan], [5.0, 5.0, 5.0], [0.1, nan, nan]])
     found = describe(experience, scores_of(1.0, nan, 0.5), rewards, share, torch.tensor([True, False, True]))
-    k1 = [0.5, -1.0, -8.0, -8.0, -8.0, -0.25]  # log p - log p_ref, negative ones too
+    k1 = [0.5, -1.0, -8.0, -8.0, -8.0, -0.25]  # log p - log p_ref, including negative ones
     wanted = {
         "objective/kl": sum(k1) / 3,
         "objective/kl_token_mean": sum(k1) / 6,
@@ -222,7 +220,7 @@ def test_every_metric_of_a_rollout_by_hand():
 
 
 def test_without_a_signal_nothing_is_learnt_from_rounding(folder):
-    """Sampling and training differ by 1e-7; normalised advantages would make full steps of that."""
+    """Sampling and training differ by 1e-7; normalised advantages would turn that into full steps."""
     roles = fresh(settings(folder))
     experience = gather(roles, PROMPTS, 1, 0, 2)
     assert not torch.equal(experience.responses.logp, experience.logp)
@@ -242,7 +240,7 @@ def test_the_share_of_the_kl_has_nothing_of_the_score(folder):
 
 
 def test_where_no_response_counts_the_kl_is_known_and_the_score_is_not(folder):
-    """A KL of 0 there would lift every budget, and be a false point of the over-optimisation curve."""
+    """A KL of 0 there would disable every budget, and add a false point to the over-optimisation curve."""
     _, experience = experienced(settings(folder))
     experience.ref_logp -= 1.0
     nothing = torch.zeros(6, 10)
@@ -253,7 +251,7 @@ def test_where_no_response_counts_the_kl_is_known_and_the_score_is_not(folder):
 
 
 def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(folder):
-    """The log-probabilities trained against come from the pass that trains, not from the KV cache."""
+    """The old log-probabilities come from the training pass, not from the KV cache."""
     roles, experience = experienced(settings(folder, dtype="bfloat16"))
     batch = to_batch(experience, torch.zeros(6, 10), EVERY, roles.settings)
     with torch.no_grad():

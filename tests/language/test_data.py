@@ -1,4 +1,4 @@
-"""Rows to tokens: every format, what is learnt of it, and an error or a count for whatever does not fit."""
+"""Rows to tokens: every format, its learnt tokens, and an error or a count for rows that do not fit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CHAT = [
 
 
 def chatml():
-    """As SmolLM2 has it: PAD is the EOS, and a newline follows the EOS of every turn."""
+    """Like SmolLM2: PAD is the EOS, and a newline follows the EOS of every turn."""
     made = tokenizer()
     made.chat_template = CHATML
     made.pad_token = "<eos>"
@@ -46,7 +46,7 @@ def chatml():
 
 
 def opening(template: str):
-    """A tokenizer that puts its own tokens around every text."""
+    """A tokenizer that adds its own tokens around every text."""
     from tokenizers import processors
 
     made = tokenizer()
@@ -88,7 +88,7 @@ def test_every_kind_of_file_gives_the_same_rows(tmp_path):
 
 
 def test_lists_and_whatever_yields_rows():
-    class Dataset:  # as datasets.Dataset does: it yields dicts, and is no list
+    class Dataset:  # like datasets.Dataset: it yields dicts, and is not a list
         def __iter__(self):
             return iter([{"text": "a"}, {"text": "b"}])
 
@@ -181,7 +181,7 @@ def test_completions_alone_are_learnt_with_their_eos(make):
     for row in ({"prompt": "ask. ", "completion": "hi you"}, messages, mixed):
         (example,) = examples([row], made)
         assert learnt(example, made) == "hi you<eos>"
-        assert example.tokens[-1] == EOS and example.learn[-1]  # nothing behind it, not even a newline
+        assert example.tokens[-1] == EOS and example.learn[-1]  # nothing after it, not even a newline
 
 
 def test_every_assistant_turn_is_learnt_and_nothing_else():
@@ -192,7 +192,7 @@ def test_every_assistant_turn_is_learnt_and_nothing_else():
     (example,) = examples([{"messages": CHAT}], made, on_completions=False)
     assert learnt(example, made) + "\n" == made.apply_chat_template(CHAT, tokenize=False)[len("<bos>") :]
     (example,) = examples([{"prompt": CHAT[:4], "completion": CHAT[4:]}], made)
-    assert learnt(example, made) == "no.<eos>"  # earlier turns of the assistant are the prompt's
+    assert learnt(example, made) == "no.<eos>"  # earlier assistant turns belong to the prompt
 
 
 def test_a_template_without_eos_gets_one_at_the_end():
@@ -223,7 +223,7 @@ def test_the_padding_token_is_never_asked(row):
 
 @pytest.mark.parametrize("template", ["$A", "<bos> $A", "<bos> $A <eos>"])
 def test_what_is_sampled_is_what_is_trained(template):
-    """A prompt has the same tokens in an example as when it is responded to."""
+    """A prompt has the same tokens in an example as in generation."""
     made = opening(template)
     made.chat_template = CHATML
     for ask, reply in (("ask. ", "reply"), (CHAT[:2], CHAT[2:3])):
@@ -231,7 +231,7 @@ def test_what_is_sampled_is_what_is_trained(template):
         (example,) = examples([{"prompt": ask, "completion": reply}], made)
         assert example.tokens[: len(prompt.tokens)] == prompt.tokens
         assert not any(example.learn[: len(prompt.tokens)]) and all(example.learn[len(prompt.tokens) :])
-        assert prompt.tokens[-1] != EOS  # the EOS that some tokenizers add would end the prompt
+        assert prompt.tokens[-1] != EOS  # an EOS that some tokenizers add would end the prompt
         assert example.tokens.count(EOS) == 1 + 2 * (not isinstance(ask, str))
 
 
@@ -289,7 +289,9 @@ def test_long_rows_are_cut_and_counted():
         UserWarning, match=r"2 of 3 rows have more than max_tokens 5 .* 1 of 3 rows have nothing"
     ):
         first, last = examples(rows, max_tokens=5)
-    assert whole(first) == "abcde" and learnt(first) == "de"  # cut: no EOS is learnt where no text ended
+    assert (
+        whole(first) == "abcde" and learnt(first) == "de"
+    )  # cut: no EOS is learnt, because the text did not end
     assert whole(last) == "ab<eos>"
     heard = []
     examples(rows, max_tokens=5, notify=heard.append)
@@ -338,7 +340,7 @@ def test_templates_that_cannot_serve_are_named():
     made.chat_template = "{{ raise_exception('roles must alternate') }}"
     with pytest.raises(ValueError, match=r"data\[0\]: the chat template refuses .*roles must alternate"):
         examples([{"messages": CHAT}], made)
-    made.chat_template = (  # earlier replies are shortened, as templates of thinking models do
+    made.chat_template = (  # earlier replies are shortened, as in templates of thinking models
         "{% for m in messages %}{{ m['content'] if loop.last else m['content'][:2] }}<eos>{% endfor %}"
     )
     with pytest.raises(ValueError, match=r"rewrites earlier turns .* prompt, the reply as completion"):

@@ -1,4 +1,4 @@
-"""samples.jsonl says of every response what happened to it, and the tables show it without harm."""
+"""samples.jsonl records the outcome of every response, and the tables show it safely."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who judges: functions and a reward model together; no column is lost and no score is made up."""
+"""Functions and a reward model judge together; no column is lost and no score is made up."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ ASKED = [prompt for prompt in PROMPTS for _ in range(2)]
 
 @pytest.fixture(scope="module")
 def sampled(tmp_path_factory):
-    """Roles and the six responses that they sampled."""
+    """Roles and their six sampled responses."""
     return experienced(settings(saved(tmp_path_factory.mktemp("model"))))
 
 
@@ -88,7 +88,7 @@ def test_where_no_function_applies_the_model_stands_alone(sampled):
 
 
 def test_functions_and_models_judge_the_very_tokens_that_were_sampled(sampled):
-    """Text that is decoded and read again may have other tokens: here some ids have no word at all."""
+    """Decoded text may give other tokens when encoded again: here some ids have no word at all."""
     roles, experience = sampled
     seen = {}
 
@@ -108,7 +108,7 @@ def test_functions_and_models_judge_the_very_tokens_that_were_sampled(sampled):
 
 
 def reward_folder(path: Path, **changes) -> str:
-    """A reward model of somebody else's, over the tiny tokenizer."""
+    """Somebody else's reward model, with the tiny tokenizer."""
     from transformers import LlamaForSequenceClassification
 
     config = tiny_llama(layers=1).config

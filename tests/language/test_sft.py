@@ -1,4 +1,4 @@
-"""Supervised fine-tuning: the loss is the text's own, packing and padding are nothing, and it learns."""
+"""Supervised fine-tuning: the correct loss, packing and padding without effect, and it learns."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_packed_examples_have_the_logits_they_have_alone(make):
             worst = max(worst, float((together[row][inside] - wanted).abs().max()))
             worst_leaking = max(worst_leaking, float((leaking[row][inside] - wanted).abs().max()))
     assert worst < 1e-5
-    assert worst_leaking > 0.1  # without the blocks, texts do see each other: the test can fail
+    assert worst_leaking > 0.1  # without the blocks, texts see each other: the test can fail
 
 
 @pytest.mark.parametrize("make", MODELS)

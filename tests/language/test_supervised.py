@@ -1,4 +1,4 @@
-"""Runs of stages one and two around their loop: their memory is told first, and they can be gone on with."""
+"""Runs of stages one and two: they print their memory needs first, and they can be resumed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def folder(tmp_path_factory) -> str:
 
 
 class Cut(Exception):
-    """What stops a run."""
+    """Stops a run."""
 
 
 def stopping(step: int):
@@ -52,13 +52,13 @@ def stopping(step: int):
 
 
 def rows_of(run_dir) -> list[dict]:
-    """The metrics without what a clock gave."""
+    """The metrics without clock times."""
     rows = Run.open(run_dir).read_metrics()
     return [{k: v for k, v in row.items() if k != "seconds" and not k.startswith("time/")} for row in rows]
 
 
 def same_end(a, b) -> bool:
-    """Whether two runs leave the same bits: the models, and every tensor of their last checkpoints."""
+    """Whether two runs end with the same bits: the models, and every tensor of their last checkpoints."""
     names = [path.relative_to(a) for path in a.rglob("*.safetensors") if "checkpoints" not in path.parts]
     assert names and all((a / name).read_bytes() == (b / name).read_bytes() for name in names)
     (first, state), (second, other) = (Run.open(run).newest()[1:] for run in (a, b))
@@ -74,12 +74,12 @@ def same_end(a, b) -> bool:
 @pytest.mark.parametrize("tune", ["lora", "full"])
 @pytest.mark.parametrize("stop", [2, 8, 11])
 def test_a_run_that_goes_on_ends_where_one_without_a_break_does(tmp_path, folder, stage, tune, stop):
-    """To the last bit, in the middle of an epoch (8), after one (11), and before the first checkpoint (2)."""
+    """Bit for bit, in the middle of an epoch (8), after one (11), and before the first checkpoint (2)."""
     train, resume, kind, data = STAGES[stage]
     settings = kind(model=folder, tune=tune, held_out=0.25, checkpoint_every=0.45, **FAST)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     summary = train(settings, data=data, run_dir=whole)
-    assert len(rows_of(whole)) == 10  # 3 minibatches of 6 examples, thrice, and what stands before
+    assert len(rows_of(whole)) == 10  # 3 minibatches of 6 examples, three times, and the rows before
     with pytest.raises(Cut):
         train(settings, data=data, run_dir=broken, listeners=[stopping(min(stop, 9))])
     events = []
