@@ -64,7 +64,7 @@ def test_every_option_has_help_and_fits_100_columns(make: Any, monkeypatch: pyte
     assert max(map(len, parser.format_help().splitlines())) <= 100
 
 
-def test_every_setting_stands_in_a_named_group() -> None:
+def test_every_setting_is_in_a_named_group() -> None:
     assert "more" not in options.training_parser("train").format_help().split("\n\n")
     listed = [name for names in options.GROUPS.values() for name in names]
     assert sorted(listed) == sorted(flags.settings_fields(TrainSettings))
@@ -92,7 +92,7 @@ CHANGED = {
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("changed", [False, True])
-def test_flags_say_every_setting_and_return_it(algorithm: str, changed: bool) -> None:
+def test_flags_express_every_setting_and_parse_back(algorithm: str, changed: bool) -> None:
     values = (
         {"hidden": (32,), "shared": True, "log_std_init": -0.5, "seed": 7} | CHANGED[algorithm]
         if changed
@@ -226,7 +226,7 @@ def test_a_flag_that_gathers_may_be_repeated() -> None:
     assert parser.read(["--prompt", "a", "--prompt", "b"]) == {"prompt": ["a", "b"]}
 
 
-def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
+def test_recipes_list_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
     text = " ".join(options.training_parser("align").format_help().split())
     assert "without its normalisation of rewards" in text
     assert "without its language-modelling loss on correct responses" in text
@@ -516,7 +516,7 @@ def test_quiet_prints_the_end_only(capsys: pytest.CaptureFixture[str], tmp_path:
     assert err == "warning: clip is high\n"
 
 
-def test_ctrl_c_says_how_to_go_on(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_ctrl_c_prints_how_to_resume(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     module = tmp_path / "my_tasks.py"
     module.write_text("")
     folder = tmp_path / "with space"
@@ -588,7 +588,7 @@ def test_python_dash_m_is_the_same() -> None:
 # ---------------------------------------------------------------------------- panel and curves
 
 
-def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) -> None:
+def test_the_panel_paints_rarely_and_shows_the_progress_of_the_run(tmp_path: Path) -> None:
     import io
 
     class Terminal(io.StringIO):

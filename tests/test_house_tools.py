@@ -101,7 +101,7 @@ def test_chains_are_counted_anywhere_and_at_the_top(tmp_path: Path):
     assert found["chains"]["."]["anywhere"]["files"] == 5
 
 
-def test_a_circle_stands_together(tmp_path: Path):
+def test_a_cycle_is_one_group(tmp_path: Path):
     package = written(
         tmp_path, a="import toy.b\n", b="import toy.c\n", c="import toy.b\nimport toy.d\n", d=""
     )
@@ -173,7 +173,7 @@ def test_what_only_the_second_round_does_is_added(tmp_path: Path):
     assert way(package, 50) == expected
 
 
-def test_a_trace_begins_and_ends_where_it_is_told(tmp_path: Path):
+def test_a_trace_begins_and_ends_at_the_given_frames(tmp_path: Path):
     package = written(tmp_path, **TOY)
     assert way(package, 1, begins="act", ends="generated") == ["work", "deep", "work", "loop"]
     with pytest.raises(RuntimeError, match="waiting"):
@@ -229,7 +229,7 @@ def test_files_that_are_gone_and_broken_resumes_are_named():
     ]
 
 
-def test_tensors_are_told_apart_by_bytes_shape_and_kind(tmp_path: Path):
+def test_tensors_differ_by_bytes_shape_and_kind(tmp_path: Path):
     import torch
     from safetensors.torch import save_file
 

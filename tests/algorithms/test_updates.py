@@ -94,7 +94,7 @@ def test_nan_behind_the_mask_changes_nothing(rule, settings):
 
 
 @pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
-def test_nan_that_a_model_says_behind_the_mask_changes_nothing(rule, settings):
+def test_nan_from_a_model_behind_the_mask_changes_nothing(rule, settings):
     class Babbling(TinyModel):
         def forward(self, batch):
             now = super().forward(batch)
@@ -134,7 +134,7 @@ def test_a_row_of_which_no_step_counts_changes_nothing(rule, settings):
     assert torch.equal(weights(some), weights(alone)) and metrics == expected
 
 
-def test_advantages_that_are_estimated_anew_must_count_too():
+def test_recomputed_advantages_must_count_too():
     def nothing(batch):
         return dataclasses.replace(batch, mask=torch.zeros_like(batch.mask))
 
@@ -186,7 +186,7 @@ def test_kl_stop_is_decided_before_the_step_and_ends_all_epochs():
     assert distance(model, again) < 1e-5
 
 
-def test_a_nan_gradient_takes_no_step_and_says_so():
+def test_a_nan_gradient_takes_no_step_and_is_reported():
     batch = make_batch(TinyModel())
     batch = dataclasses.replace(
         batch, advantages=batch.advantages.index_fill(0, torch.tensor([3]), torch.nan)
@@ -251,7 +251,7 @@ def test_extra_loss_joins_the_loss_and_its_metrics():
 
 @pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
 @pytest.mark.parametrize("micro", [None, 1, 5, 24])
-def test_extra_loss_is_told_the_count_of_the_whole_minibatch(rule, settings, micro):
+def test_extra_loss_gets_the_count_of_the_whole_minibatch(rule, settings, micro):
     """It gives a summed loss the scale of the other terms, so that micro-batches change nothing."""
     batch = make_batch(TinyModel(), rows=24, columns=3, masked=0.4)
     counts = []

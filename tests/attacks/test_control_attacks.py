@@ -121,7 +121,7 @@ print(json.dumps(found))
 """
 
 
-def test_payloads_fire_where_nobody_is_careful_and_the_watch_hears_them(tmp_path: Path):
+def test_payloads_fire_in_careless_code_and_the_watch_detects_them(tmp_path: Path):
     """The corpus can fail."""
     tests = Path(__file__).parents[1]
     path = os.pathsep.join(map(str, (tests, tests.parent / "src")))

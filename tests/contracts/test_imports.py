@@ -213,7 +213,7 @@ def test_no_module_has_the_name_of_something_public(package: str):
     assert modules and not modules & set(module.__all__)
 
 
-def test_maths_imports_torch_alone():
+def test_maths_imports_only_torch():
     allowed = {"torch", "tightrope", "__future__", "math", "dataclasses", "collections", "typing"}
     for path in (p for p in sources() if p.is_relative_to(SRC / "maths")):
         for line, name in imports(tree(path), module_of(path)):

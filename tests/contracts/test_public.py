@@ -31,7 +31,7 @@ def test_everything_public_has_a_docstring():
     assert not found, "\n".join(found)
 
 
-def test_every_module_says_what_it_is():
+def test_every_module_has_a_docstring():
     assert not [name_of(p) for p in sources() if ast.get_docstring(tree(p)) is None]
 
 

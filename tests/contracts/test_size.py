@@ -89,7 +89,7 @@ def test_lines():
     assert not too_long, "\n".join(too_long)
 
 
-def test_the_measure_counts_as_said():
+def test_the_measure_counts_as_documented():
     code = 'def f():\n "Two\\\n lines."\n if a:\n  for b in c:\n   pass\n elif d:\n  pass\n'
     function = functions(ast.parse(code))[0]
     assert length(function) == 6

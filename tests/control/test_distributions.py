@@ -63,7 +63,7 @@ def test_gsde_noise_has_the_deviation_that_its_density_claims():
     torch.testing.assert_close(logp, expected.detach(), rtol=1e-3, atol=1e-3)
 
 
-def test_gsde_holds_its_noise_and_predict_leaves_it_alone():
+def test_gsde_holds_its_noise_and_predict_does_not_change_it():
     policy, rng = make_policy(std="gsde"), np.random.default_rng(0)
     inputs = {"flat": torch.rand(4, 3)}
     policy.hold_exploration(4, rng)

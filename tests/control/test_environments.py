@@ -41,7 +41,7 @@ def test_async_vector_env_in_every_mode(mode):
 
 
 @pytest.mark.parametrize("mode", [*MODES, "NextStep", "SAME_STEP", "disabled"])
-def test_a_vector_environment_of_ones_own_in_every_mode(mode):
+def test_a_custom_vector_environment_in_every_mode(mode):
     vector = chain.ChainVector(5, mode)
     vector.mode = autoreset_mode(vector)
     assert chain.transitions(make_environments(vector, 5), COUNT) == chain.expected_transitions(5, COUNT)
@@ -241,7 +241,7 @@ def test_a_forced_backend_that_the_task_lacks():
         make_environments("CartPole-v1", 0)
 
 
-def test_envpool_that_is_missing_says_what_to_install(monkeypatch):
+def test_the_error_for_missing_envpool_names_the_package(monkeypatch):
     real = builtins.__import__
 
     def without(name, *rest, **keywords):

@@ -198,7 +198,7 @@ def test_points_of_a_grid():
 
 
 @pytest.mark.parametrize("source", ["CartPole-v1", walk])
-def test_environments_begin_anew_on_the_grid_alone_unless_they_give_their_state(tmp_path, source):
+def test_environments_are_reset_only_on_the_grid_unless_they_save_their_state(tmp_path, source):
     """Without files, signals or clocks: learn in Python resets at the same steps as a run."""
     seen: list[int] = []
     agent = tightrope.PPO(source, notify=lambda text: None, **{**SMALL, "engine": "torch"})
@@ -286,7 +286,7 @@ def test_what_a_state_may_hold():
             states.unpack(forged)
 
 
-def test_a_wrapper_with_a_state_of_its_own_hides_the_one_inside():
+def test_a_wrapper_with_its_own_state_hides_the_inner_one():
     assert states.gives_state(gym.wrappers.OrderEnforcing(walk()))
     assert not states.gives_state(gym.wrappers.DelayObservation(walk(), 2))
     assert not states.gives_state(gym.make("CartPole-v1"))
@@ -330,7 +330,7 @@ def test_a_state_of_other_shapes_is_refused(tmp_path):
         train.resume(run, env=walk)
 
 
-def test_resume_says_what_it_cannot_promise(tmp_path, monkeypatch):
+def test_resume_prints_what_it_cannot_promise(tmp_path, monkeypatch):
     settings = settings_for("CartPole-v1", engine="torch")
     killed(settings, tmp_path / "run", monkeypatch, Agent, "_one_update", 4)
     said: list[str] = []

@@ -218,7 +218,7 @@ def test_atari_truncations_bring_their_final_observation():
 @pytest.mark.parametrize(
     "env_id", ["LunarLander-v3", "HalfCheetah-v5", "CartPole-v1", "MountainCarContinuous-v0"]
 )
-def test_standard_tasks_say_nothing_on_stderr(env_id, tmp_path):
+def test_standard_tasks_print_nothing_on_stderr(env_id, tmp_path):
     if env_id != "CartPole-v1":
         pytest.importorskip({"L": "Box2D", "H": "mujoco"}.get(env_id[0], "gymnasium"))
     code = f"""

@@ -92,7 +92,7 @@ def test_an_environment_that_breaks_is_named(backend, fault, words):
     agent.close()
 
 
-def test_an_instance_that_cannot_be_replicated_is_told_what_to_pass():
+def test_the_error_for_an_instance_that_cannot_be_copied_names_the_alternative():
     env = Faulty("none")
     env.lock = __import__("threading").Lock()
     with pytest.raises(ValueError, match=r"num_envs=1|factory"):
@@ -126,7 +126,7 @@ def test_unsupported_spaces_are_named(space):
         ),
     ],
 )
-def test_a_users_mistake_exits_with_2_and_says_what_to_do(arguments, words, capsys, tmp_path):
+def test_a_users_mistake_exits_with_2_and_advice(arguments, words, capsys, tmp_path):
     try:
         code = main(["train", *arguments, "--run-dir", str(tmp_path / "run"), "--total-steps", "100"])
     except SystemExit as error:

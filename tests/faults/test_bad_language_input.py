@@ -92,7 +92,7 @@ GOOD = [{"prompt": text, "answer": text} for text in ("ab", "cd", "efg")]
     ],
     ids=lambda value: str(value)[:30] if isinstance(value, str) else "",
 )
-def test_a_mistake_exits_with_2_and_says_what_to_do(place, tmp_path, capsys, rows, reward, more, words):
+def test_a_mistake_exits_with_2_and_advice(place, tmp_path, capsys, rows, reward, more, words):
     begin = time.monotonic()
     assert run(place, tmp_path, rows, reward, *more) == 2
     error = capsys.readouterr().err
@@ -101,7 +101,7 @@ def test_a_mistake_exits_with_2_and_says_what_to_do(place, tmp_path, capsys, row
     assert time.monotonic() - begin < 20
 
 
-def test_responses_without_a_score_are_masked_counted_and_told_once(place, tmp_path, capsys):
+def test_responses_without_a_score_are_masked_counted_and_reported_once(place, tmp_path, capsys):
     assert run(place, tmp_path, GOOD, "some") == 0
     error = capsys.readouterr().err
     assert error.count("expected a finite number or None") == 1 and error.count("all returned None") == 1
@@ -110,7 +110,7 @@ def test_responses_without_a_score_are_masked_counted_and_told_once(place, tmp_p
     assert {row["objective/scores"] for row in rows} == {1.5} == {row["scores/some"] for row in rows}
 
 
-def test_a_batch_that_came_too_late_is_left_out_and_the_run_goes_on(place, tmp_path, capsys):
+def test_a_late_batch_is_left_out_and_the_run_continues(place, tmp_path, capsys):
     assert run(place, tmp_path, GOOD, "slow", "--reward-timeout", "1") == 0
     assert "was not back after 1 s" in capsys.readouterr().err
     rows = Run.open(tmp_path / "run").read_metrics()

@@ -181,7 +181,7 @@ def test_the_action_named_is_the_one_that_led_there(agent_on):
 
 
 @pytest.mark.parametrize("how", ["raise", "exit", "kill", "hang", "shape", "tuple", "nan", "reward", "reset"])
-def test_with_restart_a_run_goes_on_and_counts_it(how, agent_on):
+def test_with_restart_a_run_continues_and_counts_it(how, agent_on):
     agent = agent_on(how, on_env_fault="restart", env_timeout=0.5)
     counts = [progress.metrics["rollout/environment_restarts"] for progress in agent.iterate(256)]
     assert counts[0] == 1.0 and sum(counts) == 1.0
@@ -272,7 +272,7 @@ def test_pauses_grow_and_stay_bounded():
 
 
 @pytest.mark.parametrize(("policy", "code"), [("raise", 2), ("restart", 2)])
-def test_the_command_ends_with_2_and_says_why(policy, code, capsys, tmp_path):
+def test_the_command_exits_with_2_and_a_reason(policy, code, capsys, tmp_path):
     gym.register("tightrope_tests/Frail-v0", entry_point=lambda: Frail("raise", always=True))
     words = ["--total-steps", "500", "--run-dir", str(tmp_path / "r"), "--max-env-restarts", "2"]
     try:
@@ -452,7 +452,7 @@ class FrailVector(gym.vector.SyncVectorEnv):
     ("how", "words"),
     [("raise", "raised RuntimeError: the simulator broke"), ("hang", "not back after 0.5 s")],
 )
-def test_a_vector_environment_of_the_users_own_is_named_and_cannot_be_made_anew(how, words):
+def test_a_users_vector_environment_is_named_and_cannot_be_restarted(how, words):
     FrailVector.made = 0
     vector = FrailVector(how=how)
     agent = tightrope.PPO(vector, **{**SMALL, "num_envs": 2}, on_env_fault="restart", env_timeout=0.5)
@@ -465,7 +465,7 @@ def test_a_vector_environment_of_the_users_own_is_named_and_cannot_be_made_anew(
     vector.close()
 
 
-def test_a_vector_version_of_an_id_is_made_anew_with_all_its_copies():
+def test_a_vector_version_of_an_id_is_restarted_with_all_its_copies():
     FrailVector.made = 0
     kinds = {"entry_point": lambda: Frail("no"), "vector_entry_point": FrailVector}
     gym.register("tightrope_tests/FrailVector-v0", **kinds)

@@ -79,7 +79,7 @@ def steps(folder: Path) -> list[int]:
 
 
 @EVERY
-def test_a_checkpoint_that_fails_in_the_middle_is_said_and_training_goes_on(
+def test_a_failed_checkpoint_in_the_middle_is_reported_and_training_continues(
     tmp_path: Path, model: str, monkeypatch: pytest.MonkeyPatch, story: str
 ) -> None:
     run, _ = STORIES[story]
@@ -116,7 +116,7 @@ def test_the_last_checkpoint_must_be_written_and_the_run_can_go_on(
     assert seen == sorted(set(seen)) and steps(tmp_path / "run")[-1] == seen[-1]
 
 
-def test_the_command_line_says_it_in_one_message(
+def test_the_command_line_prints_one_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [

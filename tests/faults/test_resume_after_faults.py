@@ -43,7 +43,7 @@ class Sealed(Brittle):
 
 
 @pytest.mark.parametrize(("env", "workers"), [(Brittle, 1), (Brittle, 2), (Sealed, 1)])
-def test_restarts_are_counted_on_and_seeds_of_those_made_anew_go_on(tmp_path, monkeypatch, env, workers):
+def test_the_count_of_restarts_and_their_seeds_continue(tmp_path, monkeypatch, env, workers):
     monkeypatch.setattr(faults, "pause", lambda *_: 0.0)
     settings = settings_for(
         env, on_env_fault="restart", max_env_restarts=500, num_workers=workers, engine="torch"

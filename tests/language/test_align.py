@@ -125,7 +125,7 @@ def vowels(completions, **_):
     return [sum(c in "aeiou" for c in text) / 6 for text in completions]
 
 
-def test_a_run_that_goes_on_ends_where_one_without_a_break_does(folder, tmp_path):
+def test_a_resumed_run_ends_like_an_uninterrupted_one(folder, tmp_path):
     """Bit for bit: weights, optimiser, random numbers, prompt order, kl_beta, the gold judge's samples."""
     values = {**FAST, "checkpoint_every": 0.5, "kl_goal": 1.0, "kl_horizon": 100.0, "evaluate_every": 0.3}
     given = {"prompts": PROMPTS, "reward": letters, "gold": vowels}
@@ -244,7 +244,7 @@ def test_a_kl_budget_stops_the_run(folder, tmp_path):
     assert "train/grad_norm" in run.metrics[-2] and "train/grad_norm" not in run.metrics[-1]
 
 
-def test_no_critic_is_said_as_in_python():
+def test_critic_none_is_accepted_as_in_python():
     assert AlignSettings(critic=None, samples_per_prompt=2).critic == "none"
 
 

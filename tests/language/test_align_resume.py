@@ -160,7 +160,7 @@ def test_the_command_names_the_judge_again(tmp_path, monkeypatch, values, capsys
     assert main(["resume", str(run), "--reward", f"{judge}:score", "--quiet"]) == 0
 
 
-def test_a_function_is_asked_for_again_whatever_its_name(tmp_path, values, monkeypatch):
+def test_a_function_must_be_named_again_whatever_its_name(tmp_path, values, monkeypatch):
     """It is mistaken neither for a reward of this package nor for a folder of the same name."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rewards").mkdir()

@@ -261,7 +261,7 @@ def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(fol
     assert trained < 1e-3 < 1e-2 < sampled
 
 
-def test_a_response_without_a_sibling_that_counts_is_compared_with_nobody():
+def test_a_response_without_a_valid_sibling_has_no_baseline():
     valid = np.array([True, False, False, True, True, True, True, False, False])
     assert comparable(valid, 3).tolist() == [False] * 3 + [True] * 3 + [False] * 3
     assert comparable(np.array([True, True, False]), 3).tolist() == [True, True, False]

@@ -87,7 +87,7 @@ def test_every_kind_of_file_gives_the_same_rows(tmp_path):
     assert read_rows(tmp_path / "x.txt") == ["one", "  two "]
 
 
-def test_lists_and_whatever_yields_rows():
+def test_lists_and_other_iterables_of_rows():
     class Dataset:  # like datasets.Dataset: it yields dicts, and is not a list
         def __iter__(self):
             return iter([{"text": "a"}, {"text": "b"}])
@@ -174,7 +174,7 @@ def test_text_is_learnt_from_its_second_token_to_its_eos():
 
 
 @pytest.mark.parametrize("make", [lambda: tokenizer(chat=True), chatml])
-def test_completions_alone_are_learnt_with_their_eos(make):
+def test_only_completions_are_learnt_with_their_eos(make):
     made = make()
     messages = {"prompt": CHAT[:2], "completion": CHAT[2:3]}
     mixed = {"prompt": CHAT[:2], "completion": "hi you"}
@@ -394,7 +394,7 @@ def test_pairs_share_their_prompt_and_end_with_eos(row, prompt, chosen, rejected
     assert made.decode(list(pair.rejected[n:])) == rejected
 
 
-def test_pairs_that_say_nothing_are_counted():
+def test_uninformative_pairs_are_counted():
     rows = [
         {"prompt": "ask", "chosen": "yes", "rejected": "yes"},
         {"prompt": "ask", "chosen": "yes a", "rejected": "yes b"},
@@ -433,7 +433,7 @@ def test_long_prompts_lose_their_beginning():
     assert made.decode(list(short.tokens)) == "<bos>abc" and short.shown == "abc"
 
 
-def test_a_long_chat_loses_its_beginning_and_is_said_to_be_shown_whole():
+def test_a_long_chat_loses_its_beginning_with_a_message():
     made, heard = chatml(), []
     rows = [{"prompt": CHAT[:2]}, "abcdefghijklmno"]
     chat, _ = read_prompts(rows, made, max_tokens=12, notify=heard.append)
@@ -463,7 +463,7 @@ def test_a_bad_prompt_is_named(row, message):
 
 
 @pytest.mark.parametrize("filler", [0, 7, EOS])
-def test_padding_is_said_by_the_mask(filler):
+def test_only_the_mask_defines_padding(filler):
     rows = [[5], [6, 7, 8], []]
     tokens, real = pad_left(rows, filler)
     assert tokens.dtype == torch.int64 and real.dtype == torch.bool

@@ -1,4 +1,4 @@
-"""The KL to the reference: a language is written down whole, and expectations are sums over all responses."""
+"""The KL to the reference: a whole language is enumerated, and expectations are sums over all responses."""
 
 import dataclasses
 import math
@@ -50,11 +50,11 @@ class World:
 
     @property
     def of_scores(self) -> Tensor:
-        """The gradient of E[score] alone."""
+        """The gradient of only E[score]."""
         return gradient_of(objective(self.policy, self.reference, self.scores, 0.0), self.policy)
 
     def per_state(self, *, forward: bool = False, visits: Tensor | None = None) -> Tensor:
-        """The gradient of the states' own KL (or of KL(reference || policy)), states as often as visited."""
+        """The gradient of the states' own KL (or of KL(reference || policy)), weighted by visits."""
         states = self.language.states(self.language.tokens)
         pair = [Categorical(logits=model.logits[states]) for model in (self.policy, self.reference)]
         kl = kl_divergence(*(pair[::-1] if forward else pair))
@@ -62,7 +62,7 @@ class World:
         return gradient_of(torch.where(self.language.mask, often[:, None] * kl, 0.0).sum(), self.policy)
 
     def rewards(self, form: str, scores: Tensor) -> Tensor:
-        """Rewards per token of every response: the score at the end, and what the form adds."""
+        """Rewards per token of every response: the score at the end, and the form's KL term."""
         tokens, mask = self.language.tokens, self.language.mask
         with torch.no_grad():
             parts = (self.policy.logp(tokens), self.reference.logp(tokens))
@@ -70,9 +70,9 @@ class World:
         return with_scores(kl_rewards(form, KL_BETA, *parts, exact, mask), scores, mask)
 
     def expected(self, form: str, scores: Tensor, values: Tensor, gae_lambda: float = 1.0) -> Tensor:
-        """The expected gradient (uphill) that training follows: the product's own functions, every response.
+        """The expected gradient (uphill) of training: the library's own functions, over every response.
 
-        Each response alone is a minibatch with count 1, so that its loss is the sum over its steps.
+        Each response is its own minibatch with count 1, so that its loss is the sum over its steps.
         """
         tokens, mask, policy = self.language.tokens, self.language.mask, self.policy
         logp, ref_logp = policy.logp(tokens), self.reference.logp(tokens)
@@ -89,7 +89,7 @@ class World:
         return -gradient_of(total, policy)
 
     def some_values(self) -> Tensor:
-        """Values of an arbitrary critic: numbers that depend on the state alone."""
+        """Values of an arbitrary critic: numbers that depend only on the state."""
         return self.policy.values.detach()[self.language.states(self.language.tokens)]
 
     def true_values(self, form: str) -> Tensor:
@@ -119,7 +119,7 @@ def test_expected_gradient_is_that_of_the_objective(form: str, seed: int) -> Non
 
 @pytest.mark.parametrize("form", ["k1-reward", "exact-split"])
 def test_a_perfect_critic_makes_it_exact_at_any_lambda(form: str) -> None:
-    """Rewards lie where the critic expects them: V(s) is the mean of what still follows from s."""
+    """Rewards match the critic: V(s) is the mean of the rewards after s."""
     world = World(0)
     found = world.expected(form, world.scores, world.true_values(form), gae_lambda=0.3)
     torch.testing.assert_close(found, world.right, **EXACT)
@@ -151,7 +151,7 @@ def test_what_the_biased_forms_really_do() -> None:
         assert off_by(kl_gradient(form), whole) > 0.2, form
 
 
-def test_one_state_alone() -> None:
+def test_a_single_state() -> None:
     """Responses of one token: all sound forms agree with autograd, no biased one comes near."""
     world = World(3, words=5, length=1)
     for form in KL_FORMS:
@@ -200,7 +200,7 @@ def test_weights_make_up_for_actions_of_an_older_policy(form: str) -> None:
 
 
 class Rollout:
-    """A batch with every response as often as the policy says it, so that a mean is an expectation.
+    """A batch with every response as often as its probability, so that a mean is an expectation.
 
     Probabilities are 1/2, 1/4 and 1/4 in every state: 64 rows hold all three-token responses in proportion.
     """
@@ -229,7 +229,7 @@ class Rollout:
     def step(
         self, form: str, batch: Batch, *, normalise: bool = False, scale: float | Tensor = 1.0
     ) -> Tensor:
-        """What one step of ppo.update, a plain gradient step of size 1, changes in the logits."""
+        """The change of the logits in one step of ppo.update, a plain gradient step of size 1."""
         policy = self.world.policy
         before = policy.logits.detach().clone()
 
@@ -322,7 +322,7 @@ def test_a_discount_acts_on_the_state_that_follows() -> None:
     ],
 )
 def test_losses_by_hand(form: str, first: float, second: float) -> None:
-    """The sum over the steps at hand over the count of all; `kl_steps` are its summands."""
+    """The sum over the given steps divided by the count of all; `kl_steps` are its summands."""
     assert float(kl_loss(form, LOGP, REF_LOGP, KL, MASK, 8)) == pytest.approx((first + second) / 8)
     steps = kl_steps(form, LOGP, REF_LOGP, KL, MASK)
     torch.testing.assert_close(steps, torch.tensor([[first, second, 0.0]]))
@@ -384,7 +384,7 @@ def test_no_gradient_reaches_the_reference_or_the_weights(form: str) -> None:
     assert found[0] is not None and found[1] is None and found[2] is None
 
 
-def test_sound_forms_have_no_bias_and_the_others_say_theirs() -> None:
+def test_sound_forms_have_no_bias_and_the_others_state_theirs() -> None:
     assert [bias_of(form) for form in KL_FORMS] == [None] * 4
     for form in BIASED_KL_FORMS:
         assert form.split("-")[0] in str(bias_of(form)) and form.split("-")[1] in str(bias_of(form))
@@ -431,7 +431,7 @@ def test_the_controller_follows_zieglers_equation() -> None:
 
 
 def test_the_controller_is_its_fields() -> None:
-    """Saved and loaded in the middle it goes on as if it had not been."""
+    """Saved and loaded in the middle, it continues without a difference."""
     first = AdaptiveKL(0.2, 6.0).next(9.0, 64)
     again = AdaptiveKL(**dataclasses.asdict(first))
     assert again.next(2.0, 64) == first.next(2.0, 64) and first.kl_beta != 0.2

@@ -222,7 +222,7 @@ def test_a_reward_model_does_not_train_the_language_head() -> None:
     assert entry(found, "model: gradients") == size_of(parts(real(LLAMA)).base.parameters())
 
 
-def test_a_job_that_fits_passes_and_one_that_does_not_is_told_what_helps() -> None:
+def test_a_job_that_fits_passes_and_one_that_does_not_gets_advice() -> None:
     job = dataclasses.replace(ALIGN, tune="full", critic="separate", micro_batch_size=16)
     found = ledger(LLAMA, job)
     check(found, None)
@@ -303,7 +303,7 @@ def test_control_groups_of_the_first_version(tmp_path: Path) -> None:
     assert available_memory("cpu", machine(tmp_path, {**MEMINFO, **files})) == 0
 
 
-def test_this_machine_says_something() -> None:
+def test_the_memory_of_this_machine_is_none_or_positive() -> None:
     assert available_memory("cpu") is None or available_memory("cpu") > 0
 
 

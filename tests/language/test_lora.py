@@ -38,7 +38,7 @@ def test_a_new_adapter_changes_nothing_and_a_shaken_one_does(make):
 
 
 @pytest.mark.parametrize("make", MODELS)
-def test_every_role_gets_the_gradient_it_gets_alone(make):
+def test_every_role_gets_the_same_gradient_as_on_its_own(make):
     """Three roles in one graph with switches and one backward pass: no gradient is lost or mixed."""
     tokens, real, _ = padded()
     names = ("policy", "critic", "reward")

@@ -102,7 +102,7 @@ def test_points_that_are_too_much_alike_once_squared_are_named_and_raise_nothing
 
 
 @pytest.mark.parametrize("count", range(FEWEST_POINTS))
-def test_too_few_points_are_said_to_be_too_few(count):
+def test_too_few_points_are_reported(count):
     found = fit([(float(kl), curve(kl)) for kl in range(count)])
     assert found.reason == f"{count} points at different KLs, at least {FEWEST_POINTS} are needed"
     assert math.isnan(found.peak_kl) and math.isnan(found.gold(1.0)) and not found.decided
@@ -112,7 +112,7 @@ def test_many_points_at_one_kl_are_few_points():
     assert "1 points" in fit([(3.0, 0.1 * i) for i in range(20)]).reason
 
 
-def test_kls_that_hardly_differ_are_said_to_be_too_near():
+def test_kls_that_hardly_differ_are_reported_as_too_close():
     found = fit([(kl, curve(kl)) for kl in np.linspace(10, 20, 12)])
     assert found.reason == "the KLs reach from 10 to 20, too near to each other"
 
@@ -259,7 +259,7 @@ def test_the_metric_is_the_fits_and_is_declared():
 
 
 @given(cut=st.integers(0, 30))
-def test_a_restored_monitor_goes_on_as_if_nothing_had_happened(cut):
+def test_a_restored_monitor_continues_without_a_difference(cut):
     rng = np.random.default_rng(8)
     points = noisy_run(rng, np.linspace(0, 40, 30), noise=0.02)
     proxy = [math.nan if i == 3 else float(i) for i in range(30)]

@@ -99,7 +99,7 @@ def test_the_last_real_token_is_found_by_the_mask():
 
 @pytest.mark.parametrize("make", MODELS)
 @pytest.mark.parametrize("filler", [0, EOS, 50])
-def test_padding_is_nothing_to_a_score(make, filler):
+def test_padding_does_not_affect_a_score(make, filler):
     """Any side, any amount, any id, including the id of the EOS that ends every text."""
     model, texts = scorer(make), [[5, 6, EOS], [7, 8, 9, 10, EOS], [11, EOS]]
     alone = torch.cat([model.score(*pad_right([text])) for text in texts])
@@ -153,7 +153,7 @@ def test_calibration_by_hand():
     assert calibration(torch.tensor([1000.0]))[0] == pytest.approx(0.0)
 
 
-def test_calibration_tells_honest_from_overconfident():
+def test_calibration_distinguishes_honest_from_overconfident():
     generator = torch.Generator().manual_seed(0)
     difference = 2 * torch.randn(20_000, generator=generator)
     right = torch.rand(20_000, generator=generator) < torch.sigmoid(difference.abs())
@@ -305,7 +305,7 @@ def test_peft_opens_the_adapter_with_its_head(tmp_path, make):
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
 
 
-def test_the_run_folder_tells_what_happened(tmp_path, folder):
+def test_the_run_folder_records_what_happened(tmp_path, folder):
     data = tmp_path / "pairs.jsonl"
     data.write_text("".join(json.dumps(row) + "\n" for row in preferences(40)))
     settings = settings_of(folder, data=str(data), validation=str(data), num_epochs=1)

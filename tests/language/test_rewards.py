@@ -109,7 +109,7 @@ def test_the_prompt_column_is_not_passed_twice_and_other_clashes_are_named():
 
 
 @pytest.mark.parametrize("on_error", ["mask", "raise", None])
-def test_a_function_that_wants_what_is_not_there_is_told_what_is(on_error):
+def test_a_function_with_an_unknown_argument_gets_the_list_of_columns(on_error):
     def accuracy(completions, answers):
         return [0.0] * len(completions)
 
@@ -194,7 +194,7 @@ def test_a_sample_that_no_function_applies_to_is_masked_and_never_a_zero():
 @pytest.mark.parametrize(
     "bad", [math.nan, math.inf, -math.inf, 1e39, 10**400, torch.tensor(math.nan)], ids=str
 )
-def test_a_score_that_is_not_finite_masks_its_sample_whatever_the_others_say(bad):
+def test_a_score_that_is_not_finite_masks_its_sample_despite_other_scores(bad):
     """1e39 is finite here, but infinite in float32, the type of training."""
     found = score(constant(1.0, bad, 3.0), length)
     assert found.valid.tolist() == [True, False, True]
@@ -301,7 +301,7 @@ def test_a_run_in_which_nothing_can_be_scored_ends():
         rewards.score(PROMPTS, TEXTS, IDS)
 
 
-def test_one_scored_batch_starts_the_count_anew():
+def test_one_scored_batch_restarts_the_count():
     answers = iter([[None], [None], [1.0], [None], [None]])
     rewards = Rewards([lambda **_: next(answers)])
     valid = [bool(rewards.score(["p"], ["c"], [[1]]).valid[0]) for _ in range(5)]

@@ -27,7 +27,7 @@ def uniforms(rows, columns, seed=0):
     return torch.rand(rows, columns, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_positions_count_real_tokens_alone():
+def test_positions_count_only_real_tokens():
     real = torch.tensor([[False, False, True, True, True, False]])
     assert positions(real).tolist() == [[0, 0, 0, 1, 2, 2]]
 

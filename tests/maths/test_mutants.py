@@ -257,7 +257,7 @@ def load(tmp_path: Path) -> Iterator[Callable[[Mutant | None], ModuleType]]:
         del sys.modules[module]
 
 
-def test_the_package_as_it_stands_passes(load: Callable[[Mutant | None], ModuleType]) -> None:
+def test_the_current_package_passes(load: Callable[[Mutant | None], ModuleType]) -> None:
     copy = load(None)
     assert copy is not tightrope.maths
     check_all(copy)

@@ -205,7 +205,7 @@ def test_what_is_new_is_let_pass(end):
     assert not differences(end, more, bits=True)
 
 
-def test_another_machine_has_a_tolerance_and_says_why(end):
+def test_another_machine_has_a_tolerance_with_a_reason(end):
     was = read(FIRST / "expected" / "machine.json")
     assert how(was, dict(was)).bits
     for name in was:

@@ -218,7 +218,7 @@ def test_a_save_that_fails_leaves_nothing(
         (SafetensorError("No space left on device (os error 28)"), 28, "Make room on the disk"),
     ],
 )
-def test_what_the_disk_refuses_is_said_with_the_path_and_what_to_do(
+def test_disk_errors_name_the_path_and_the_remedy(
     tmp_path: Path, cause: Exception, number: int, advice: str
 ) -> None:
     with pytest.raises(CannotWrite) as error, writing(tmp_path / "c"):
@@ -228,7 +228,7 @@ def test_what_the_disk_refuses_is_said_with_the_path_and_what_to_do(
     assert advice in str(error.value) and str(cause.args[-1]) in str(error.value)
 
 
-def test_the_manifest_says_what_it_was_written_with(folder: Path) -> None:
+def test_the_manifest_names_the_versions_that_wrote_it(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     assert set(manifest) == {
         "format", "version", "step", "files", "versions", "settings_sha256", "sha256"
@@ -267,7 +267,7 @@ def test_a_manifest_imports_no_library(tmp_path: Path) -> None:
     }
 
 
-def test_other_versions_are_told(folder: Path) -> None:
+def test_other_versions_are_reported(folder: Path) -> None:
     written = checkpoint.read_manifest(folder)["versions"]
     assert versions.differences(written) == ""
     assert versions.differences({**written, "torch": "1.0"}) == f"torch 1.0 -> {torch.__version__}"

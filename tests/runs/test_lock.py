@@ -63,7 +63,7 @@ def end(process: subprocess.Popen[str]) -> None:
     process.stdout.close()
 
 
-def test_a_second_writer_is_refused_and_told_who_writes(path: Path) -> None:
+def test_a_second_writer_is_refused_with_the_name_of_the_first(path: Path) -> None:
     first = writer(path)
     try:
         before = {p.name: p.read_bytes() for p in path.iterdir() if p.is_file()}
@@ -119,7 +119,7 @@ def test_a_child_that_outlives_a_killed_writer_holds_nothing(path: Path) -> None
 
 
 @pytest.mark.parametrize("content", [None, "", "{", '{"env": "CartPole-v1"}'])
-def test_resume_on_the_command_line_names_the_writer_whatever_the_settings_hold(
+def test_resume_on_the_command_line_names_the_writer_for_any_settings(
     path: Path, content: str | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The process that holds the lock may have written half of their file."""
@@ -157,7 +157,7 @@ def test_the_lock_is_no_link(path: Path, tmp_path: Path) -> None:
     assert (tmp_path / "precious").read_text() == "mine"
 
 
-def test_a_folder_that_holds_a_lock_alone_is_free(tmp_path: Path) -> None:
+def test_a_folder_with_only_a_lock_is_free(tmp_path: Path) -> None:
     (tmp_path / NAME).write_text("")
     Run.create(tmp_path, {"seed": 1}, "name").close()
     with pytest.raises(ValueError, match="not empty"):

@@ -111,7 +111,7 @@ def test_failures_at_random_never_cost_the_best_or_the_last(
     assert 5 < 59 - len(saved) < 40
 
 
-def test_an_old_one_that_cannot_be_deleted_is_said_and_no_failure(
+def test_an_old_one_that_cannot_be_deleted_is_reported_and_is_no_failure(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[str] = []

@@ -64,7 +64,7 @@ def test_a_changed_digit_of_the_settings_is_found(tmp_path: Path) -> None:
         assert again.settings == {"steps": 7000}
 
 
-def test_who_goes_on_reads_the_settings_behind_the_lock(
+def test_a_resume_reads_the_settings_after_taking_the_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The previous writer changes the settings at the last moment: no process sees the old ones."""
@@ -162,7 +162,7 @@ def test_rewind_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
         assert not [name for name in left if name.startswith(".")]
 
 
-def test_without_a_checkpoint_a_run_begins_anew(tmp_path: Path) -> None:
+def test_without_a_checkpoint_a_run_starts_over(tmp_path: Path) -> None:
     with Run.create(tmp_path / "a", SETTINGS, "name") as run:
         run.record(10, 1.0, {})
         run.rewind(None)

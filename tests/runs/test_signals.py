@@ -22,7 +22,7 @@ BOTH = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signa
 
 
 @BOTH
-def test_a_signal_stops_at_once_and_says_its_exit_code(number, code):
+def test_a_signal_stops_at_once_with_its_exit_code(number, code):
     before = signal.getsignal(number)
     with pytest.raises(signals.Stopped) as caught, signals.stoppable(), signals.stoppable():
         os.kill(os.getpid(), number)

@@ -70,7 +70,7 @@ def test_cut_anywhere_a_replacement_leaves_the_old_or_the_new(
     assert {version for count, _, version in found if count == len(disk.log)} == {2}
 
 
-def test_cut_anywhere_a_run_goes_on_with_no_row_doubled_and_none_missing(
+def test_cut_anywhere_a_run_continues_with_no_row_twice_and_none_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, rows = tmp_path / "run", {}

@@ -88,7 +88,7 @@ def test_cache_can_be_switched_off(word, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_numbas_own_setting_is_left_alone():
+def test_numbas_own_setting_is_not_changed():
     import numba
 
     assert "tightrope" not in str(numba.config.CACHE_DIR)
@@ -147,7 +147,7 @@ def test_folders_long_out_of_use_are_removed(tmp_path, monkeypatch):
     assert {path.name for path in root.iterdir()} - {cache.cache_folder().name} == {"1" * 16, "not-ours"}
 
 
-def test_scipys_linear_algebra_is_whole_after_its_blas_was_taken_alone():
+def test_scipys_linear_algebra_works_after_only_its_blas_was_loaded():
     code = (
         "import tightrope.control.engine.compiled.primitives\n"
         "import scipy.linalg, scipy.linalg.cython_blas as b, numpy\n"
