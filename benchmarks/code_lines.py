@@ -176,7 +176,7 @@ def chains(paths: list[Path], package: Path) -> dict[str, Any]:
 
 
 def within(path: Path, folder: Path) -> bool:
-    """Whether a file lies in a folder or below it."""
+    """Whether a file is in a folder or below it."""
     return path.is_relative_to(folder)
 
 

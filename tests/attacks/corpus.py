@@ -73,7 +73,7 @@ def torch_zip() -> bytes:
     return file.getvalue()
 
 
-HUGE = struct.pack("<Q", 10 * 2**30) + b'{"a":'  # safetensors with a header of 10 GB, as it says
+HUGE = struct.pack("<Q", 10 * 2**30) + b'{"a":'  # safetensors that declares a header of 10 GB
 DEEP = b"[" * 200_000
 MODULE = f"import os\n{CODE}\ndef function(*_, **__): return [0.0]\nclass Model: pass\n"
 

@@ -126,7 +126,7 @@ def run_python(block: Block, page: Path, names: dict[str, Any]) -> None:
 
 
 def stands_in(quoted: str, text: str) -> bool:
-    """Whether lines stand together in a text, at any indentation; a line with only `...` skips lines."""
+    """Whether lines are adjacent in a text, at any indentation; a line with only `...` skips lines."""
     whole = text.splitlines()
     for chunk in re.split(r"^\s*\.\.\.\s*\n", quoted, flags=re.MULTILINE):
         lines = dedented(chunk.splitlines())

@@ -174,7 +174,7 @@ def test_whitened_rewards_are_divided_by_the_deviation_of_what_counts_and_keep_t
 
 def test_every_metric_of_a_rollout_by_hand():
     """Three responses of 2, 3 and 1 tokens; sums over a response, means where named so. The second has no
-    score: it tells of the policy as the others do, and of the reward nothing.
+    score: it counts in the metrics of the policy, but not in those of the reward.
     """
     nan = math.nan
     mask = torch.tensor([[True, True, False], [True, True, True], [True, False, False]])

@@ -211,7 +211,7 @@ def test_a_template_without_eos_gets_one_at_the_end():
     ids=["text", "completion", "messages"],
 )
 def test_the_padding_token_is_never_asked(row):
-    """PAD of its own, PAD equal to EOS, no PAD: the same tokens, and the EOS is learnt."""
+    """Separate PAD, PAD equal to EOS, no PAD: the same tokens, and the EOS is learnt."""
     found = []
     for pad in ("<pad>", "<eos>", None):
         made = tokenizer(chat=True)

@@ -114,7 +114,7 @@ def test_an_eos_in_the_last_place_that_there_is_ends_the_response():
 
 
 def test_frequencies_are_the_probabilities():
-    """Inverse transform of evenly spaced uniforms: each token as often as its probability says, to one
+    """Inverse transform of evenly spaced uniforms: each token in proportion to its probability, to one
     draw.
     """
     torch.manual_seed(0)

@@ -181,7 +181,7 @@ def folder(tmp_path_factory) -> str:
 @pytest.mark.parametrize("tune", ["full", "lora"])
 @pytest.mark.parametrize("make", MODELS)
 def test_it_learns_facts_and_where_they_end(tmp_path, make, tune):
-    """Also where the model has no PAD (GPT-2): after a fact it says EOS. The folder loads elsewhere."""
+    """Also for a model without PAD (GPT-2): after a fact it emits EOS. The folder loads elsewhere."""
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
     source, events = saved(tmp_path / "base", make()), []
@@ -258,7 +258,7 @@ def test_of_several_eos_the_tokenizers_own_closes_a_text():
 
 def test_same_seed_same_bits_other_seed_others(tmp_path, folder):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        torch.manual_seed(hash(name) % 1000)  # the global generator has no say
+        torch.manual_seed(hash(name) % 1000)  # the global generator has no effect
         train_sft(settings_of(folder, seed=seed, held_out=0.2), data=FACTS, run_dir=tmp_path / name)
     assert weights(tmp_path / "a") == weights(tmp_path / "b") != weights(tmp_path / "c")
 

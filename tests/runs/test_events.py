@@ -102,7 +102,7 @@ class Killed(Exception):
 
 
 def change_at(step: int, die_at: int | None = None) -> Any:
-    """A listener that changes the learning rate behind a step, and ends the run behind another."""
+    """A listener that changes the learning rate after one step and ends the run after another."""
 
     def listen(event: Event) -> Change | None:
         if isinstance(event, Updated) and event.step == die_at:
