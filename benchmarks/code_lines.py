@@ -1,17 +1,16 @@
-"""How much code the package is, and how deep its imports go.
+"""How much code the package has, and how deep its imports go.
 
     python benchmarks/code_lines.py                                            # a table
     python benchmarks/code_lines.py --json
     python benchmarks/code_lines.py --save benchmarks/results/code_lines.json
 
-A code line holds something that is neither blank, a comment nor a docstring. The text of any other string
-counts, with all its lines. Folders are counted with what lies below them.
+A code line is not blank and not only a comment or docstring. Other strings count with all their lines.
+Folders include their subfolders.
 
-An import chain is a list of files, each of which imports the next one. ``anywhere``: wherever the import
-stands, lazy ones and those for type checkers too; ``at the top``: those alone that run when a file is
-imported. ``from package import name`` leads to the file of ``name`` where it has one, else to the package's
-``__init__.py``. Files that import each other in a circle stand in the chain together, all of them, sorted,
-and are named.
+An import chain is a list of files, each of which imports the next one. ``anywhere`` includes lazy imports and
+those for type checkers; ``at the top`` only the imports that run when a file is imported. ``from package
+import name`` leads to the file of ``name`` if there is one, else to the package's ``__init__.py``. An import
+cycle appears in the chain as one group of its files, sorted, and is named.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ def docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
 
 
 def code_lines(source: str) -> int:
-    """Lines of a source that are neither blank, nor only comment or docstring."""
+    """The number of source lines that are not blank and not only a comment or docstring."""
     texts = [(d.lineno, d.end_lineno or d.lineno) for d in docstrings(ast.parse(source))]
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
@@ -70,7 +69,7 @@ def files(package: Path = PACKAGE) -> list[Path]:
 
 
 def at_the_top(node: ast.AST) -> Iterator[ast.AST]:
-    """What runs on import: everything but functions and what is for type checkers."""
+    """The statements that run on import: everything except functions and code for type checkers."""
     yield node
     for child in ast.iter_child_nodes(node):
         typing = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
@@ -79,7 +78,7 @@ def at_the_top(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def imported(path: Path, package: Path, *, top: bool = False) -> set[Path]:
-    """The files of the package that a file imports: anywhere, or ``top``: when it is imported itself."""
+    """The files of the package that a file imports; with ``top``, only by imports that run at once."""
     found = set()
     home = [package.name, *path.relative_to(package).parts[:-1]]
     tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -99,7 +98,7 @@ def imported(path: Path, package: Path, *, top: bool = False) -> set[Path]:
 
 
 def file_of(name: list[str], package: Path) -> Path | None:
-    """The file of a dotted name, or of the module that the name stands in; None outside of the package."""
+    """The file of a dotted name, or of the module that contains the name; None outside the package."""
     while name and name[0] == package.name:
         place = package.joinpath(*name[1:])
         if (place / "__init__.py").is_file():
@@ -111,7 +110,7 @@ def file_of(name: list[str], package: Path) -> Path | None:
 
 
 def circles(graph: dict[Path, set[Path]]) -> dict[Path, frozenset[Path]]:
-    """File -> the files that it reaches and that reach it, itself among them."""
+    """File -> the files that it reaches and that reach it, including itself."""
 
     @cache
     def reached(start: Path) -> frozenset[Path]:
@@ -126,7 +125,7 @@ def circles(graph: dict[Path, set[Path]]) -> dict[Path, frozenset[Path]]:
 
 
 def longest_chain(graph: dict[Path, set[Path]]) -> list[Path]:
-    """The longest chain of imports; files of a circle stand together. The first by name of equal ones."""
+    """The longest chain of imports, a cycle as one group of files; of equal ones, the first by name."""
     circle = circles(graph)
 
     @cache
@@ -177,7 +176,7 @@ def chains(paths: list[Path], package: Path) -> dict[str, Any]:
 
 
 def within(path: Path, folder: Path) -> bool:
-    """Whether a file lies in a folder or below it."""
+    """Whether a file is in a folder or below it."""
     return path.is_relative_to(folder)
 
 
@@ -187,7 +186,7 @@ def short(path: Path, package: Path) -> str:
 
 
 def text(found: dict[str, Any]) -> str:
-    """The figures for people to read."""
+    """The figures as readable text."""
     lines = [f"{found['code']:,} code lines in {found['files']} files (without __init__.py)", ""]
     lines += [f"{'folder':20} {'code':>7} {'lines':>7} {'files':>6}"]
     for name, row in found["folders"].items():
@@ -203,7 +202,7 @@ def text(found: dict[str, Any]) -> str:
 
 
 def commit() -> str:
-    """The newest commit that changed the package; a + behind it: with changes that are not committed."""
+    """The newest commit that changed the package; a trailing + marks uncommitted changes."""
     git = ["git", "-C", str(ROOT)]
     told = {"capture_output": True, "text": True, "check": True}
     try:

@@ -1,13 +1,12 @@
-"""Returns of the control story: every listed task, several seeds, the presets as they stand.
+"""Returns on the control tasks: every listed task, several seeds, unchanged presets.
 
     python benchmarks/control.py                       # all tasks; writes benchmarks/results/control/*.json
     python benchmarks/control.py --tasks CartPole-v1 --seeds 3 --jobs 2
     python benchmarks/control.py --render              # only writes the tables into docs/ and README
 
-Each run is `tightrope train TASK --seed S` in a process of its own, on one core, without evaluation while
-training; then `tightrope evaluate` plays 100 deterministic episodes with the final policy, on seeds far from
-the training's. The first seed is 0 for every task. Nothing is chosen by its result: a run that is listed is a
-run that was made.
+Each run is `tightrope train TASK --seed S` in a separate process, on one core, without evaluation during
+training. Then `tightrope evaluate` plays 100 deterministic episodes with the final policy, on seeds far from
+the training seeds. The first seed is 0 for every task. No run is selected by its result: every run is listed.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ TASKS: list[tuple[str, str, int, int, str]] = [
     ("Hopper-v5", "ppo", 1_000_000, 5, "2,480"),
     ("Walker2d-v5", "ppo", 1_000_000, 5, "3,410"),
 ]
-# stable-baselines3's zoo: one tuned agent a task, deterministic evaluation; older versions of some tasks
+# stable-baselines3's zoo: one tuned agent per task, deterministic evaluation; older versions of some tasks
 PEERS = {
     "CartPole-v1": "500",
     "Acrobot-v1": "-73.5 (1M)",
@@ -103,7 +102,7 @@ def summarise(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on and with."""
+    """The machine and the versions behind the figures."""
     packages = ("torch", "numpy", "numba", "gymnasium", "mujoco", "box2d")
     names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     return {
@@ -115,7 +114,7 @@ def machine() -> dict[str, Any]:
 
 
 def measure(task: str, algorithm: str, steps: int, seeds: int, goal: str, jobs: int) -> dict[str, Any]:
-    """All seeds of one row, ``jobs`` at a time, each on a core of its own where the system allows it."""
+    """All seeds of one row, ``jobs`` at a time, each on its own core if the system allows it."""
     cores: SimpleQueue[int | None] = SimpleQueue()
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     for i in range(jobs):

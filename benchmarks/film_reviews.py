@@ -1,12 +1,13 @@
-"""The three stages on film reviews over several seeds: does the gold judge follow, and what without a KL?
+"""The three stages on film reviews over several seeds: does the gold score follow the reward, with and
+without KL?
 
-    python benchmarks/film_reviews.py                    # an hour, two runs at a time with a thread each
-    python benchmarks/film_reviews.py --collect FOLDER   # the tables of runs that are there
+    python benchmarks/film_reviews.py                    # an hour, two runs at a time with one thread each
+    python benchmarks/film_reviews.py --collect FOLDER   # the tables of existing runs
 
-One SFT model and one reward model; PPO from them with each seed; once without a KL, once each with weights
-of the KL that stay as they are; and shorter with each kind of critic. The gold judge has read other
-reviews than the reward model and is asked on the beginnings of reviews that PPO never saw: P(positive) of 512
-responses before and after. Settings were tuned on seeds 1 to 3, which are not among the seeds.
+One SFT model and one reward model. PPO from them with each seed; once without a KL penalty; once for each
+other fixed KL weight; and shorter with each kind of critic. The gold judge learned from other reviews than
+the reward model. It scores continuations of reviews that PPO never saw: P(positive) of 512 responses before
+and after. Settings were tuned on seeds 1 to 3, which are not among the seeds.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ JOBS: dict[str, tuple[str, ...]] = {
 
 
 def run(folder: Path, name: str) -> None:
-    """One run of the demo, whose first two stages lie beside it; nothing where it has been run."""
+    """Run the demo once, with the first two stages beside it; skip a run that already exists."""
     result = folder / f"{name}.json"
     if result.exists():
         return
@@ -78,7 +79,7 @@ def collect(folder: Path) -> dict[str, Any]:
 
 
 def text(results: dict[str, Any]) -> str:
-    """A row a run, the critics apart, and what the monitor said without a KL."""
+    """One row per run, the critics in their own table, and the monitor's messages without a KL penalty."""
     lines = ["| run | gold before | gold after | score | KL, nats | distinct pairs of tokens | PPO, s |"]
     lines.append("|---|---|---|---|---|---|---|")
     for name, found in results["runs"].items():
@@ -158,7 +159,7 @@ def main() -> None:
 
 
 def sentence(results: dict[str, Any]) -> str:
-    """What the README says of the runs."""
+    """The sentences about the runs in the README."""
     held = [found for name, found in results["runs"].items() if name.startswith("seed-")]
     before, after = (statistics.mean(found[f"gold_{when}"] for found in held) for when in ("before", "after"))
     slowest = max(found["ppo_seconds"] for found in held)
@@ -184,7 +185,7 @@ BLOCKS = (
 
 
 def render(results: dict[str, Any]) -> None:
-    """The tables into docs/benchmarks.md, the sentence into the README."""
+    """Write the tables into docs/benchmarks.md and the sentences into the README."""
     for page, name, body in BLOCKS:
         page.write_text(fill(page.read_text(encoding="utf-8"), name, body(results)), encoding="utf-8")
 

@@ -1,14 +1,14 @@
-"""PPO on a language model beside TRL 1.12 (the last with PPO): response tokens per second, whole processes.
+"""PPO on a language model against TRL 1.12 (the last with PPO): response tokens per second, whole processes.
 
     python benchmarks/language.py --peer-python VENV/bin/python          # glassllm: ten minutes
     python benchmarks/language.py --peer-python VENV/bin/python --models smollm2   # an hour
     python benchmarks/language.py --render       # the table of the committed results into docs/benchmarks.md
 
-Installs nothing. Same model, same batch, responses of exactly 24 tokens, 4 epochs, one minibatch, float32 but
-where a row says bfloat16, reference and reward model included. What one trunk adapts, and the form of the
-KL, are those of the film-review demo that reaches its quality goal. Each measurement is two fresh processes,
-of n1 and n2 iterations, timed from outside; rate = tokens of the difference / difference of wall times, so
-that loading drops out. Contenders take turns; a ratio is the median of the ratios within pairs.
+Installs nothing. Same model, same batch, responses of exactly 24 tokens, 4 epochs, one minibatch, float32
+unless a row states bfloat16, including reference and reward model. The adapted layers and the form of the KL
+are those of the film-review demo that reaches its quality goal. Each measurement is two fresh processes with
+n1 and n2 iterations, timed from outside; rate = difference in tokens / difference in wall time, so that
+loading cancels out. Contenders take turns; a ratio is the median of the ratios within pairs.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def values_of(name: str, layout: str) -> dict[str, Any]:
 
 
 def ours(job: dict[str, Any]) -> dict[str, Any]:
-    """Our side of one run: reward model on the trunk or, in full fine-tuning, one with its own."""
+    """Our side of one run: the reward model shares the trunk or, in full fine-tuning, has its own."""
     from tightrope.language import align
 
     values = dict(job["values"])
@@ -81,7 +81,7 @@ def ours(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def one_run(command: list[str], job: dict[str, Any], environment: dict[str, str]) -> dict[str, Any]:
-    """A process that does the job: its wall time and memory from outside, its tokens from inside."""
+    """Run the job in a process: wall time and memory measured from outside, tokens from inside."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "result.json"
         found = run_process([*command, json.dumps(job), str(file)], environment)
@@ -91,14 +91,14 @@ def one_run(command: list[str], job: dict[str, Any], environment: dict[str, str]
 def rate(
     command: list[str], job: dict[str, Any], between: tuple[int, int], environment: dict[str, str]
 ) -> dict:
-    """Response tokens per second by difference."""
+    """Response tokens per second, from the difference of two runs."""
     short, long = (one_run(command, job | {"iterations": n}, environment) for n in between)
     tokens, wall = long["tokens"] - short["tokens"], long["wall"] - short["wall"]
     return {"rate": tokens / wall, "memory_mb": long["memory_mb"], "short": short, "long": long}
 
 
 def make_reward(name: str, folder: str, full: bool, out: str) -> None:
-    """A reward model as the row has it; how good it is does not matter for its speed."""
+    """A reward model with the row's layout; its quality does not affect speed."""
     from tightrope.language import RewardSettings, train_reward
 
     stage = {"tune": "lora", "lora_layers": None, **STAGES[name]["reward"]}
@@ -112,7 +112,7 @@ def make_reward(name: str, folder: str, full: bool, out: str) -> None:
 def compare(
     name: str, layouts: list[str], peer_python: str | None, pairs: int, rewards: Path
 ) -> list[dict[str, Any]]:
-    """The layouts of one model beside the peer: in every pair the peer runs once, each layout once."""
+    """The layouts of one model against the peer: in every pair the peer and each layout run once."""
     from tightrope.language.model.packaged import find_model
 
     shape, folder = MODELS[name], find_model(name)
@@ -126,7 +126,7 @@ def compare(
         full = values["tune"] == "full"
         reward = str(rewards / f"{name}-{layout}")
         job_of_reward = json.dumps({"name": name, "folder": folder, "full": full, "out": reward})
-        # in a process of its own: the system counts the peak of a parent as its children's
+        # in a separate process: the system counts the peak of a parent as its children's
         run_process([sys.executable, __file__, "reward", job_of_reward], our_environment())
         between = shape["peer"] if full else shape["ours"]  # every weight takes about as long as the peer
         mine = job | {"values": values, "reward": reward}
@@ -155,7 +155,7 @@ def _row(name: str, layout: str, values: dict[str, Any], taken: list[dict[str, A
 
 
 def text(results: dict[str, Any]) -> str:
-    """A row a layout, and where our time goes."""
+    """One row per layout, with the shares of our time."""
     lines = [
         "| model | layout | adapted | tightrope, tokens/s (MB) | TRL 1.12 | ratio "
         "| generate | score | update |",
@@ -199,7 +199,7 @@ BLOCKS = ((PAGE, "language", text), (README, "readme-language", short_text))
 
 
 def render(results: dict[str, Any]) -> None:
-    """The tables into docs/benchmarks.md and the README."""
+    """Write the tables into docs/benchmarks.md and the README."""
     for page, name, body in BLOCKS:
         page.write_text(fill(page.read_text(encoding="utf-8"), name, body(results)), encoding="utf-8")
 
@@ -229,7 +229,7 @@ def main(words: list[str] | None = None) -> None:
 
 
 def measure(options: argparse.Namespace, words: list[str]) -> None:
-    """Run every row that was asked for; rows of the results file that were not are kept."""
+    """Run every requested row; keep the other rows of the results file."""
     results: dict[str, Any] = {
         "date": datetime.date.today().isoformat(),
         "command": " ".join(

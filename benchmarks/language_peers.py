@@ -2,7 +2,7 @@
 
     python language_peers.py '{"folder": ..., "batch": 64, "tokens": 24, "iterations": 4}' RESULT.json
 
-This file imports nothing of tightrope. TRL removed PPO in 1.13.
+This file does not import tightrope. TRL removed PPO in 1.13.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ OPENINGS = ["The film was very", "I went to see this", "The story of a man who",
 
 
 def train(job: dict[str, Any]) -> dict[str, Any]:
-    """Full fine-tuning of policy and critic, reference and reward model beside them: TRL's only layout
-    here.
-    """
+    """Full fine-tuning of policy and critic, separate reference and reward model: TRL's only layout here."""
     os.environ.update(HF_HUB_OFFLINE="1", TRL_EXPERIMENTAL_SILENCE="1", WANDB_DISABLED="true")
     import torch
     from datasets import Dataset

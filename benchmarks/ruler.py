@@ -1,23 +1,22 @@
-"""The ruler: a small run of every kind, and hashes of what it leaves. A refactoring that changes no number
-changes none of them.
+"""The ruler: a small run of every kind, and hashes of its results, which a refactoring must not change.
 
     python benchmarks/ruler.py record benchmarks/results/ruler.json   # before
     python benchmarks/ruler.py compare benchmarks/results/ruler.json  # after, on the same machine
 
-``compare`` runs all again, names every kind, file, metric and tensor that differs, and exits with 1. It uses
-the public surface alone: the command line, ``tightrope`` and ``tightrope.language``, and the files of a run.
-Each run is a process of its own with one thread. Of each run are hashed
+``compare`` repeats all runs, names every kind, file, metric and tensor that differs, and exits with 1. It
+uses only the public interface: the command line, ``tightrope`` and ``tightrope.language``, and the files of a
+run. Each run is a separate process with one thread. These parts of each run are hashed:
 
     tensors   every .safetensors file of the newest checkpoint, best/, model/, adapter/ or a saved agent:
-              ``values`` are the bytes, whatever they are called; ``names`` the same with file and name
+              ``values`` hashes the bytes without their names; ``names`` includes file and name
     rows      every .jsonl file: metrics, episodes, samples, answers; and the end in summary.json
-    resumed   runs of the command line alone: the same run is killed after its first checkpoint and resumed;
-              here stand the differences to the run without a break, none if all is well
+    resumed   only runs of the command line: the same run is killed after its first checkpoint and resumed;
+              lists the differences from the uninterrupted run, none if all is well
 
-Numbers of clocks are left out, by name (see CLOCKS). Hashes are SHA-256, shortened to 16 digits. The last
-bits depend on the processor and on the versions of the libraries, which stand beside them: record anew
-before a refactoring where ``compare`` says that these differ. ``--quick`` leaves out what is resumed;
-``--renamed`` accepts other names of tensors, where a refactoring means to change them.
+Clock times are excluded by name (see CLOCKS). Hashes are SHA-256, shortened to 16 digits. The last bits
+depend on the processor and the library versions, which are recorded too: record again before a refactoring if
+``compare`` reports that these differ. ``--quick`` skips the resumed runs; ``--renamed`` accepts renamed
+tensors, for a refactoring that renames them on purpose.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from ruler_kinds import KINDS, TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
 CLOCKS = {
-    "seconds", "wall_seconds", "steps_per_second", "date", "run_dir",  # the last one: where, not what
+    "seconds", "wall_seconds", "steps_per_second", "date", "run_dir",  # the last one is a place, not a result
     "time/seconds", "time/fps", "time/env_seconds", "time/act_seconds", "time/update_seconds",
     "time/score_seconds", "time/generate_seconds", "time/tokens_per_second",
     "time/checkpoint_seconds", "time/checkpoint_megabytes",
@@ -59,7 +58,7 @@ def digest(data: bytes | str) -> str:
 
 
 def timeless(value: Any) -> Any:
-    """A JSON value without what clocks put into it."""
+    """A JSON value without clock times."""
     if isinstance(value, list):
         return [timeless(item) for item in value]
     if isinstance(value, dict):
@@ -74,7 +73,7 @@ def newest(run: Path) -> Path | None:
 
 
 def tensors_of(run: Path) -> dict[str, str]:
-    """File and name -> hash of dtype, shape and bytes, of every tensor that a run leaves."""
+    """File and name -> hash of dtype, shape and bytes, for every tensor of a finished run."""
     import torch
     from safetensors.torch import load_file
 
@@ -93,7 +92,7 @@ def tensors_of(run: Path) -> dict[str, str]:
 
 
 def table(rows: list[Any]) -> dict[str, Any]:
-    """Hashes of rows: of all, and of each column with its place in time."""
+    """Hashes of rows: of all rows, and of each column with its row numbers."""
     rows = timeless(rows)
     columns: dict[str, list[Any]] = {}
     for number, row in enumerate(rows):
@@ -104,7 +103,7 @@ def table(rows: list[Any]) -> dict[str, Any]:
 
 
 def left(run: Path) -> dict[str, Any]:
-    """The hashes of everything that a finished run leaves."""
+    """The hashes of all results of a finished run."""
     tensors = tensors_of(run)
     if not tensors:
         raise RuntimeError(f"{run.name} left no tensors.")
@@ -127,21 +126,21 @@ def left(run: Path) -> dict[str, Any]:
 
 
 def environment() -> dict[str, str]:
-    """One thread, and this checkout's package."""
+    """Environment variables for one thread and this checkout's package."""
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     path = os.pathsep.join(filter(None, (str(ROOT / "src"), os.environ.get("PYTHONPATH"))))
     return {**os.environ, **threads, "PYTHONPATH": path, "HF_HUB_OFFLINE": "1", "PYTHONHASHSEED": "0"}
 
 
 def start(words: list[str], base: Path) -> subprocess.Popen[str]:
-    """A process of its own, in ``base``; a process group, so that a kill takes its workers along."""
+    """Start a process in ``base``, in its own process group, so that a kill also ends its workers."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     command = [sys.executable, *words]
     return subprocess.Popen(command, cwd=base, env=environment(), start_new_session=True, **pipes)
 
 
 def ended(words: list[str], base: Path) -> None:
-    """Run to the end; RuntimeError with what was printed when it fails."""
+    """Wait for the end; RuntimeError with the output if it fails."""
     process = start(words, base)
     said, _ = process.communicate()
     if process.returncode:
@@ -149,7 +148,7 @@ def ended(words: list[str], base: Path) -> None:
 
 
 def commands(kind: str, run: str) -> tuple[list[str], list[str] | None]:
-    """The words that run a kind, and those that resume it, into the folder ``run``."""
+    """The command lines that run a kind and resume it, in the folder ``run``."""
     words = once(KINDS[kind].split())
     if words[0] in ("agents", "judged"):
         return [TASKS, words[0], run], None
@@ -161,7 +160,7 @@ def commands(kind: str, run: str) -> tuple[list[str], list[str] | None]:
 
 
 def once(words: list[str]) -> list[str]:
-    """Words in which of a flag that is given twice the last value counts, in the place of the first."""
+    """The words with each flag once: the last value, at the position of the first."""
     found: dict[str, list[str]] = {}
     flag = words[0]
     for word in words:
@@ -173,12 +172,12 @@ def once(words: list[str]) -> list[str]:
 
 
 def flag_of(words: list[str], flag: str) -> str:
-    """The value that stands behind a flag."""
+    """The value of a flag."""
     return words[words.index(flag) + 1]
 
 
 def killed(words: list[str], base: Path, run: str) -> int:
-    """Kill a run once its first checkpoint is whole; the step of the newest one then."""
+    """Kill a run once its first checkpoint is complete; returns the step of the newest one."""
     process = start(words, base)
     manifests = base / run / "checkpoints"
     while process.poll() is None and not list(manifests.glob("step-*/manifest.json")):
@@ -193,7 +192,7 @@ def killed(words: list[str], base: Path, run: str) -> int:
 
 
 def resumed(kind: str, base: Path, whole: dict[str, Any]) -> list[str]:
-    """Differences between the run without a break and one that was killed and gone on with."""
+    """Differences between the uninterrupted run and one that was killed and resumed."""
     for number in range(TRIES):
         run = f"{kind}-killed-{number}"
         words, again = commands(kind, run)
@@ -206,8 +205,8 @@ def resumed(kind: str, base: Path, whole: dict[str, Any]) -> list[str]:
 
 
 def measured(kinds: list[str], base: Path, quick: bool) -> dict[str, Any]:
-    """Kind -> what it left, run after run; a kind that fails leaves ``failed``, what it said. Those that need
-    the reward model have it before them.
+    """Kind -> its results, one run after the other; a kind that fails has ``failed`` with its output. The
+    reward model runs before the kinds that need it.
     """
     from ruler_tasks import write_data
 
@@ -228,7 +227,7 @@ def measured(kinds: list[str], base: Path, quick: bool) -> dict[str, Any]:
 
 
 def one(kind: str, base: Path, quick: bool) -> dict[str, Any]:
-    """Run a kind, and again with a break where that can be. RuntimeError when it fails."""
+    """Run a kind, and if possible again with a kill and a resume. RuntimeError if it fails."""
     words, again = commands(kind, kind)
     ended(words, base)
     found = left(base / kind)
@@ -238,7 +237,7 @@ def one(kind: str, base: Path, quick: bool) -> dict[str, Any]:
 
 
 def told(found: dict[str, Any]) -> str:
-    """What a run left, in a line."""
+    """The results of a run in one line."""
     if "failed" in found:
         return "failed"
     tensors, broken = found["tensors"], "; resumed it differs" if found.get("resumed") else ""
@@ -249,8 +248,8 @@ def told(found: dict[str, Any]) -> str:
 
 
 def differences(wanted: dict[str, Any], found: dict[str, Any], *, renamed: bool = False) -> list[str]:
-    """What differs between two answers of `one`, a line each; empty when nothing does. ``renamed``: the same
-    tensors in other files or under other names are no difference.
+    """The differences between two results of `one`, one line each; empty if there are none. With ``renamed``,
+    tensors that only changed their file or name do not count.
     """
     if "failed" in found or "failed" in wanted:
         return [f"failed: {found.get('failed', 'only when it was recorded')}"]
@@ -273,7 +272,7 @@ def differences(wanted: dict[str, Any], found: dict[str, Any], *, renamed: bool 
 
 
 def named(old: dict[str, str], new: dict[str, str], most: int = 8) -> str:
-    """The names whose hashes differ, those that are gone (-) and those that are new (+)."""
+    """The names with different hashes, removed names (-) and new names (+)."""
     other = [name for name in old if name in new and old[name] != new[name]]
     other += [f"-{name}" for name in old if name not in new] + [f"+{name}" for name in new if name not in old]
     more = f" and {len(other) - most} more" if len(other) > most else ""
@@ -281,7 +280,7 @@ def named(old: dict[str, str], new: dict[str, str], most: int = 8) -> str:
 
 
 def machine() -> dict[str, Any]:
-    """What the last bits depend on."""
+    """The processor and versions that the last bits depend on."""
     import torch
 
     found = {"python": platform.python_version(), "cores": os.cpu_count()}
@@ -290,7 +289,7 @@ def machine() -> dict[str, Any]:
 
 
 def compare(given: argparse.Namespace, base: Path) -> int:
-    """Run the kinds of a record again; 1 when anything differs."""
+    """Run the kinds of a record again; returns 1 if anything differs."""
     record = json.loads(given.file.read_text())
     there, here = record["machine"], machine()
     changed = [f"{name} {there.get(name)} -> {here[name]}" for name in here if there.get(name) != here[name]]
@@ -331,7 +330,7 @@ def main(words: list[str] | None = None) -> int:
 
 
 def unfit(found: dict[str, Any]) -> bool:
-    """Whether a run failed, or ended otherwise after a break."""
+    """Whether a run failed, or ended differently after a resume."""
     return "failed" in found or bool(found.get("resumed"))
 
 

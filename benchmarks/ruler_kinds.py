@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-TASKS = "ruler_tasks.py"  # a copy of it lies in the folder of the runs
+TASKS = "ruler_tasks.py"  # a copy of it is in the folder of the runs
 TRAIN = (
     "--seed 1 --threads 1 --num-envs 4 --num-steps 64 --num-epochs 2 --total-steps 4096 --evaluate-every 0.3 "
     "--evaluation-episodes 2 --checkpoint-every 0.2 --vector-backend serial"
@@ -14,7 +14,7 @@ ALIGN = (
     f"--num-epochs 2 --max-new-tokens 6 --checkpoint-every 0.2 --evaluate-every 0.5 --gold {TASKS}:vowels"
 )
 OWN = f"--env-module {TASKS}"
-# kind -> the words after `tightrope`, where the last of a flag counts; or what ruler_tasks.py does in Python
+# kind -> the words after `tightrope`, where the last value of a flag counts; or a job of ruler_tasks.py
 KINDS: dict[str, str] = {
     "cartpole-compiled": f"train CartPole-v1 {TRAIN} --engine fused",
     "cartpole-torch": f"train CartPole-v1 {TRAIN} --engine torch --total-steps 2048",

@@ -1,9 +1,8 @@
-"""What the runs of ruler.py train on: two tiny tasks, three small data files and a reward; and what is done
-in Python rather than on the command line.
+"""The training material of ruler.py: two tiny tasks, small data files and a reward; and its jobs in Python.
 
-    tightrope train RulerShelf-v0 --env-module benchmarks/ruler_tasks.py
-    tightrope align --reward benchmarks/ruler_tasks.py:vowels ...
-    python benchmarks/ruler_tasks.py agents FOLDER
+tightrope train RulerShelf-v0 --env-module benchmarks/ruler_tasks.py
+tightrope align --reward benchmarks/ruler_tasks.py:vowels ...
+python benchmarks/ruler_tasks.py agents FOLDER
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ TEXT = "the film was good and its story bad but i like an actor who never sings 
 
 
 class Shelf(gymnasium.Env):
-    """Take items from a shelf; what is gone must not be taken. Dict observations carry the mask."""
+    """Take items from a shelf; missing items are masked. Dict observations contain the mask."""
 
     action_space = gymnasium.spaces.MultiDiscrete([5, 2])
     observation_space = gymnasium.spaces.Dict({
@@ -37,7 +36,7 @@ class Shelf(gymnasium.Env):
         return self._observation(), {}
 
     def step(self, action):
-        """Take one item, in a hurry or not; truncated after four of the five on day 0."""
+        """Take one item, hurried or not; truncated after four of the five on day 0."""
         item, hurry = int(action[0]), int(action[1])
         assert self.left[item], "a masked action was taken"
         self.left[item] = 0
@@ -53,7 +52,7 @@ class Shelf(gymnasium.Env):
 
 
 class Picture(gymnasium.Env):
-    """Say in which of four corners the bright square stands. It gives its state, so no reset is needed."""
+    """Name the corner of the bright square, one of four. It can save its state, so it needs no reset."""
 
     observation_space = gymnasium.spaces.Box(0, 255, (16, 16, 1), np.uint8)
     action_space = gymnasium.spaces.Discrete(4)
@@ -77,11 +76,11 @@ class Picture(gymnasium.Env):
         return image
 
     def get_state(self) -> dict[str, int]:
-        """What the next steps depend on, besides the generator."""
+        """Everything that the next steps depend on, except the generator."""
         return {"corner": self.corner, "time": self.time}
 
     def set_state(self, state: dict[str, int]) -> None:
-        """Back to such a state."""
+        """Restore such a state."""
         self.corner, self.time = state["corner"], state["time"]
 
 
@@ -91,12 +90,12 @@ for name, task in {"RulerShelf-v0": Shelf, "RulerPicture-v0": Picture}.items():
 
 
 def vowels(prompts: list[str], completions: list[str], **columns: Any) -> list[float | None]:
-    """The share of vowels; None, as rewards may, for a response that begins with z."""
+    """The share of vowels; None, which rewards may return, for a response that begins with z."""
     return [None if text[:1] == "z" else sum(c in "aeiou" for c in text) / 8 for text in completions]
 
 
 def write_data(folder: Path) -> None:
-    """texts.jsonl, pairs.jsonl, prompts.jsonl and plain.txt: words in orders that arithmetic decides."""
+    """Write texts.jsonl, pairs.jsonl, prompts.jsonl and plain.txt, with the words in a computed order."""
     words = TEXT.split()
     lines = [[words[(i * k + k) % len(words)] for i in range(3, 9)] for k in range(1, 33)]
     halves = [(" ".join(line[:3]) + " ", " ".join(line[3:])) for line in lines]
@@ -117,7 +116,7 @@ def write_rows(path: Path, rows: list[Any]) -> None:
 
 
 def agents(folder: Path) -> None:
-    """Three agents through their Python face: iterate, predict, value, save, load, and learn again."""
+    """Three agents through the Python interface: iterate, predict, value, save, load, and learn again."""
     import tightrope
 
     common = {"seed": 3, "num_envs": 2, "num_steps": 32, "threads": 1, "notify": lambda text: None}
@@ -140,7 +139,7 @@ def agents(folder: Path) -> None:
 
 
 def judged(folder: Path) -> None:
-    """``align`` against two rewards called in Python, and answers of what it left."""
+    """``align`` with two Python rewards, and responses of the resulting model."""
     from tightrope.language import align, sample_run
 
     prompts = [json.loads(line)["prompt"] for line in Path("prompts.jsonl").read_text().splitlines()]

@@ -2,10 +2,10 @@
 
     python benchmarks/scaling.py                # two minutes; nothing else should run
 
-Every point is the smallest of several timings (what other programs take can only add). Two fits describe a
-series: cost = a + b x by least squares, with 1 - R^2 as what it leaves unexplained, and the exponent p of
-cost ~ x^p through the points: 1 is linear, below 1 is cheaper than linear (fixed costs, or matrix products
-that grow more efficient).
+Every point is the smallest of several timings, because other programs can only add time. Two fits describe a
+series: cost = a + b x by least squares, with 1 - R^2 as the unexplained share, and the exponent p of cost ~
+x^p through the points: 1 is linear, below 1 is cheaper than linear (fixed costs, or matrix products that
+become more efficient).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def fit(points: Sequence[tuple[float, float]]) -> dict[str, float]:
 
 
 def series(unit: str, points: list[tuple[float, float]]) -> dict[str, Any]:
-    """A series of points with what fits it."""
+    """A series of points with its fits."""
     return {"unit": unit, "points": points, **fit(points)}
 
 
@@ -63,7 +63,7 @@ def _agent(**values: Any) -> Any:
 
 
 def rollout_seconds(repeats: int, **values: Any) -> float:
-    """The fastest of ``repeats`` whole updates (collect, advantages, learn), the first one left out."""
+    """The fastest of ``repeats`` whole updates (collect, advantages, learn), without the first one."""
     agent = _agent(**values)
     updates, best = agent.iterate(10**9), math.inf
     next(updates)
@@ -76,7 +76,7 @@ def rollout_seconds(repeats: int, **values: Any) -> float:
 
 
 def minibatch_microseconds(repeats: int, **values: Any) -> tuple[int, float]:
-    """Parameters of the networks, and the fastest of ``repeats`` updates in microseconds per minibatch."""
+    """The number of parameters, and the fastest of ``repeats`` updates in microseconds per minibatch."""
     agent = _agent(**values)
     seconds: Counter[str] = Counter()
     clocked(agent.engine, "update", "update", seconds)
@@ -91,11 +91,11 @@ def minibatch_microseconds(repeats: int, **values: Any) -> tuple[int, float]:
 
 
 def steps_series(repeats: int) -> list[tuple[float, float]]:
-    """Seconds of training after so many steps: one run, looked at on its way; the best of a few runs."""
+    """Seconds of training at several step counts of one run; the best of a few runs."""
     marks = [8 * 128 * k for k in (4, 8, 16, 32, 64)]
     best = dict.fromkeys(marks, math.inf)
     for _ in range(max(1, repeats // 2)):
-        agent = _agent(vector_backend="serial")  # every row is a step there: whole rollouts meet the marks
+        agent = _agent(vector_backend="serial")  # every row is a step, so rollouts hit the counts exactly
         updates = agent.iterate(marks[-1] + 8 * 128)
         next(updates)
         begin, offset = time.perf_counter(), agent.steps

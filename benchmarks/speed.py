@@ -1,23 +1,23 @@
-"""tightrope beside stable-baselines3 (sbx, PureJaxRL): identical settings, whole processes.
+"""tightrope against stable-baselines3 (sbx, PureJaxRL): identical settings, whole processes.
 
     python benchmarks/speed.py --peer-python VENV/bin/python   # half an hour; nothing else should run
     python benchmarks/speed.py --quick                         # one pair, a few steps: does it work?
     python benchmarks/speed.py --render                        # the results into docs/performance.md
 
 Installs nothing. A peer runs in its own interpreter (default: this one, if it can import the peer).
-PureJaxRL joins in on CartPole when the environment variable PUREJAXRL names the folder of its ppo.py.
+PureJaxRL takes part on CartPole if the environment variable PUREJAXRL names the folder of its ppo.py.
 
-How a rate comes about: each measurement is two fresh processes, one of n1 and one of n2 steps, their wall
-time taken from outside, and rate = (n2 - n1) / (wall2 - wall1). Imports, compilation, the making of
-environments and the last save cost both the same and drop out; what is left is the training loop with
-everything it does, metrics written to a file included. n2 - n1 is seconds of training even for us.
-Measurements come in pairs (A B, then B A ...), and the ratio is the median of the ratios within pairs, so
-that a machine that slows down for a while slows down both.
+How a rate is measured: each measurement is two fresh processes, one with n1 and one with n2 steps, timed from
+outside, and rate = (n2 - n1) / (wall2 - wall1). Imports, compilation, creating the environments and the last
+save cost both the same and cancel out. What remains is the whole training loop, including metrics written to
+a file. n2 - n1 is seconds of training even for us. Measurements come in pairs (A B, then B A ...), and the
+ratio is the median of the ratios within pairs, so that a temporary slowdown of the machine affects both
+sides.
 
-Both sides learn from the same number of transitions, with the same number of optimiser steps, counted by
-the optimiser itself and checked (``check_work``). One difference is inherent: Gymnasium's vector CartPole
-spends a row on every reset. tightrope does not count these rows as steps, goes on for the transitions it
-owes, and takes a few per cent more optimiser steps than its peer, whose environments reset within the step.
+Both sides learn from the same number of transitions, with the same number of optimiser steps, counted by the
+optimiser itself and checked (``check_work``). One difference is inherent: Gymnasium's vector CartPole spends
+a row on every reset. tightrope does not count these rows as steps, collects the missing transitions, and
+takes a few per cent more optimiser steps than its peer, whose environments reset within the step.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ QUICK = {"cartpole-zoo": (2, 22), "cartpole-large": (1, 4)}  # the others: (1, 4
 
 
 def measure(train: Any, between: tuple[int, int], least_seconds: float) -> dict[str, Any]:
-    """A rate by difference; taken again when other work on the machine spoiled the difference."""
+    """A rate by difference; measured again if other work on the machine spoiled the difference."""
     for attempt in range(3):
         short, long = train(between[0]), train(between[1])
         if "call_seconds" in long:  # one compiled call, timed by the peer itself
@@ -92,7 +92,7 @@ def measure(train: Any, between: tuple[int, int], least_seconds: float) -> dict[
 
 
 def start_up(scenario: dict[str, Any]) -> dict[str, float]:
-    """A short run with an empty cache, then again: what compiling costs once, in time and memory."""
+    """A short run with an empty cache, then again: the one-time cost of compiling, in time and memory."""
     with tempfile.TemporaryDirectory() as cache:
         cold = train_ours(scenario, 1, watch_memory=True, XDG_CACHE_HOME=cache)
         warm = [train_ours(scenario, 1, XDG_CACHE_HOME=cache) for _ in range(3)]
@@ -107,7 +107,7 @@ def start_up(scenario: dict[str, Any]) -> dict[str, float]:
 def compare(
     scenario: dict[str, Any], peers: dict[str, str], pairs: int, least_seconds: float
 ) -> dict[str, Any]:
-    """Everything about one scenario; ``peers``: name -> interpreter."""
+    """All measurements of one scenario; ``peers``: name -> interpreter."""
     contenders: dict[str, Any] = {"tightrope": lambda n, **more: train_ours(scenario, n, **more)}
     if not scenario["env"].startswith("CartPole"):
         peers = {peer: python for peer, python in peers.items() if peer != "purejaxrl"}
@@ -156,7 +156,7 @@ def _versions() -> dict[str, str]:
 
 
 def _find_peers(python: str, wanted: list[str] | None) -> dict[str, dict[str, str]]:
-    """The peers that this interpreter can import, with versions. ValueError: one asked for is missing."""
+    """The peers that this interpreter can import, with versions. ValueError if a requested one is missing."""
     found = written_by([python, str(HERE / "speed_peers.py"), "versions"], plain_environment())
     missing = [peer for peer in wanted or [] if peer not in found]
     if missing:
@@ -197,7 +197,7 @@ def benchmark(options: argparse.Namespace) -> dict[str, Any]:
     results["scenarios"], results["peers"] = kept.get("scenarios", []), kept.get("peers", {}) | peers
     if "command" in kept:
         results["command"] = f"{kept['command']}; then {results['command']}"
-    train_ours(SCENARIOS[0], 1)  # whatever it had to compile is in the usual cache from here on
+    train_ours(SCENARIOS[0], 1)  # everything it had to compile is in the usual cache from here on
     for scenario in _scenarios(options):
         pairs, least = (1, 0.0) if options.quick else (options.pairs, LEAST_SECONDS)
         found = compare(scenario, dict.fromkeys(peers, options.peer_python), pairs, least)
@@ -211,9 +211,7 @@ def benchmark(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _kept(options: argparse.Namespace) -> dict[str, Any]:
-    """Of an earlier results file the scenarios that are not measured now, and its peers: with --scenarios
-    alone.
-    """
+    """Only with --scenarios: the peers and the unmeasured scenarios of an earlier results file."""
     if options.scenarios is None or options.results is None or not options.results.exists():
         return {}
     earlier = json.loads(options.results.read_text(encoding="utf-8"))
@@ -223,12 +221,12 @@ def _kept(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _public_words(words: list[str]) -> list[str]:
-    """The command line without folders of this machine."""
+    """The command line without this machine's folders."""
     return [Path(word).name if os.path.isabs(word) else word for word in words]
 
 
 def render(page: Path, results: Path, scaling: Path) -> None:
-    """Fill the page's blocks with the figures of the two files: those blocks and files that are there."""
+    """Fill the page's blocks with the figures of the two files; missing blocks and files are skipped."""
     text = page.read_text(encoding="utf-8")
     for name, file, words in (
         ("speed", results, report.speed_text),

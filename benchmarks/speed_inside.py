@@ -1,9 +1,9 @@
-"""Where tightrope's own time goes: one run with clocks around environments, actor, values and update.
+"""How tightrope spends its time: one run with timers around environments, actor, values and update.
 
     python speed_inside.py '{"env": "CartPole-v1", "num_envs": 8, ...}' RESULT.json
 
-The clocks cost about a microsecond a step, so speeds are not taken from here. Also measures the floor's unit:
-float32 products of 64 x 64 x 64 on one core.
+The timers cost about a microsecond per step, so do not take speeds from here. This file also measures the
+unit of the floor: float32 products of 64 x 64 x 64 on one core.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ WARM_ROLLOUTS = 3
 
 
 def clocked(owner: Any, name: str, label: str, seconds: Counter[str]) -> None:
-    """Add the time spent in ``owner.name`` to ``seconds[label]`` from now on."""
+    """From now on, add the time spent in ``owner.name`` to ``seconds[label]``."""
     function = getattr(owner, name)
 
     def call(*arguments: Any, **keywords: Any) -> Any:

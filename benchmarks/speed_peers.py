@@ -2,12 +2,12 @@
 
     python speed_peers.py stable-baselines3 '{"env": "CartPole-v1", "num_envs": 8, ...}' RESULT.json
 
-This file imports nothing of tightrope. It writes steps and optimiser steps (as the optimiser itself counted
-them); the wall time is taken from outside. ``speed_peers.py versions RESULT.json`` writes what is installed.
+This file does not import tightrope. It writes steps and optimiser steps (counted by the optimiser itself);
+the wall time is measured from outside. ``speed_peers.py versions RESULT.json`` writes the installed versions.
 
-PureJaxRL is not a package: the environment variable PUREJAXRL names the folder that holds its ppo.py. Its
-whole run is one compiled call, environment included, and it writes the seconds of that call alone, so that
-neither its start nor its compilation counts.
+PureJaxRL is not a package: the environment variable PUREJAXRL names the folder of its ppo.py. Its whole run
+is one compiled call, including the environment. It writes only the seconds of that call, without start-up and
+compilation.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def installed() -> dict[str, dict[str, str]]:
 
 
 def train(peer: str, scenario: dict[str, Any], total_steps: int) -> dict[str, Any]:
-    """Train with the scenario's settings; metrics of every update go to a file, as ours do."""
+    """Train with the scenario's settings; the metrics of every update go to a file, as in our run."""
     import torch
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.logger import configure
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-    torch.set_num_threads(1)  # its best for networks this small
+    torch.set_num_threads(1)  # the fastest choice for networks this small
     algorithm = importlib.import_module(PACKAGES[peer][0]).PPO
     vector = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}[scenario["peer_vec"]]
     env = make_vec_env(
@@ -82,7 +82,7 @@ def train(peer: str, scenario: dict[str, Any], total_steps: int) -> dict[str, An
 
 
 class _Absent(types.ModuleType):
-    """Stands for a package that PureJaxRL's wrappers import for tasks that are not run here."""
+    """Placeholder for a package that PureJaxRL's wrappers import for tasks that are not run here."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -91,9 +91,7 @@ class _Absent(types.ModuleType):
 
 
 def train_purejaxrl(scenario: dict[str, Any], total_steps: int) -> dict[str, Any]:
-    """PureJaxRL's ppo.py as it is published, with the scenario's settings; its value loss is always
-    clipped.
-    """
+    """PureJaxRL's published ppo.py with the scenario's settings; its value loss is always clipped."""
     import jax
 
     for name in ("brax", "brax.envs", "brax.envs.wrappers", "brax.envs.wrappers.training", "navix"):
@@ -131,7 +129,7 @@ def train_purejaxrl(scenario: dict[str, Any], total_steps: int) -> dict[str, Any
 
 
 def main(words: list[str]) -> None:
-    """Run what the command line says and write the result file."""
+    """Run the job of the command line and write the result file."""
     if words[0] == "versions":
         result: Any = installed()
     elif words[0] == "purejaxrl":

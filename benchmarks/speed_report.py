@@ -1,4 +1,4 @@
-"""What the speed benchmark computes from its raw measurements, and how it writes it down. Pure functions."""
+"""Computes and formats the results of the speed benchmark from its raw measurements. Pure functions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PARTS = ("env", "act", "advantages", "update", "rest")
 
 
 def tightrope_settings(scenario: dict[str, Any]) -> dict[str, Any]:
-    """Every setting that could tell tightrope from its peers; nothing is left to a preset of the task."""
+    """Every setting that could differ between tightrope and its peers; none comes from a preset."""
     names = (
         "num_envs",
         "num_steps",
@@ -64,9 +64,9 @@ def flags(settings: dict[str, Any]) -> list[str]:
 def rate(short: dict[str, Any], long: dict[str, Any], least_seconds: float = 0.0) -> float:
     """Steps/s by difference: (steps2 - steps1) / (wall2 - wall1) of a short and a long process.
 
-    Both processes pay the same start-up and the same end, so that the difference holds training alone.
-    ValueError when the long run took less than ``least_seconds`` more than the short one: the start-up of two
-    processes differs by tenths of a second, and a small difference would be mostly that.
+    Both processes pay the same start-up and the same end, so the difference contains only training.
+    ValueError if the long run took less than ``least_seconds`` more than the short one: start-up varies by
+    tenths of a second, and a small difference would be mostly that.
     """
     steps, wall = long["steps"] - short["steps"], long["wall"] - short["wall"]
     if steps <= 0 or wall <= max(0.0, least_seconds):
@@ -89,12 +89,12 @@ def optimiser_steps(rollouts: int, rows: int, num_epochs: int, minibatch_size: i
 
 
 def check_work(scenario: dict[str, Any], run: dict[str, Any], *, phantoms: bool) -> None:
-    """ValueError unless a run took the optimiser steps that its transitions call for.
+    """ValueError unless a run took the optimiser steps that its transitions require.
 
-    Where every row of a rollout is a transition the number must be exact. ``phantoms``: a NEXT_STEP vector
+    If every row of a rollout is a transition, the number must be exact. ``phantoms``: a NEXT_STEP vector
     environment spends a row on each reset. tightrope does not count such rows as steps, fills its budget with
-    further (also shorter) rollouts, and so takes a few per cent *more* optimiser steps for the same
-    transitions: never fewer.
+    more (and possibly shorter) rollouts, and so takes a few per cent *more* optimiser steps for the same
+    transitions, never fewer.
     """
     rollout = scenario["num_envs"] * scenario["num_steps"]
     epochs, size = scenario["num_epochs"], scenario["minibatch_size"]
@@ -111,7 +111,8 @@ def update_flops(networks: Sequence[Sequence[int]], rows: int) -> int:
     """Floating-point operations of the matrix products of one minibatch update.
 
     ``networks``: layer sizes, e.g. (4, 64, 64, 2). A product [m, k] x [k, n] counts 2 m k n. Each layer has
-    one forward, one for the gradient of its weight and, but for the first layer, one for that of its input.
+    one forward, one for the gradient of its weight and, except for the first layer, one for that of its
+    input.
     """
     total = 0
     for sizes in networks:
@@ -161,7 +162,7 @@ def _settings_text(s: dict[str, Any]) -> str:
 
 
 def speed_table(results: dict[str, Any]) -> str:
-    """Median steps/s of everybody, and our ratio to each peer: median over the pairs (smallest-largest)."""
+    """Median steps/s of all contenders; our ratio to each peer: median over the pairs (smallest-largest)."""
     peers = list(results["peers"])
     head = ["scenario", "environment", "envs x steps, minibatch, epochs", "tightrope", *peers]
     rows = []
@@ -173,7 +174,7 @@ def speed_table(results: dict[str, Any]) -> str:
 
 
 def short_text(results: dict[str, Any]) -> str:
-    """Steps/s of everybody and our ratio to each, for the README."""
+    """Steps/s of all contenders and our ratio to each, for the README."""
     peers = list(results["peers"])
     head = ["task", "envs x steps, minibatch, epochs", "tightrope", *(f"{p} (ratio)" for p in peers)]
     rows = []
@@ -187,7 +188,7 @@ def short_text(results: dict[str, Any]) -> str:
 
 
 def breakdown_table(results: dict[str, Any]) -> str:
-    """Where our time goes, per step of all environments, and a minibatch update beside its floor."""
+    """Our time per step of all environments, by part, and a minibatch update beside its floor."""
     head = [
         "scenario",
         "environments",
@@ -283,7 +284,7 @@ def scaling_text(results: dict[str, Any]) -> str:
 
 
 def fill(page: str, name: str, body: str) -> str:
-    """The page with the block from ``<!-- name -->`` to ``<!-- /name -->`` replaced; ValueError: none."""
+    """The page with the block ``<!-- name -->`` to ``<!-- /name -->`` replaced; ValueError if missing."""
     pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
     if len(pattern.findall(page)) != 1:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The processes that speed.py times from outside, and what they used."""
+"""The processes that speed.py times from outside, and their use of memory."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from typing import Any
 import speed_report as report
 
 HERE = Path(__file__).resolve().parent
-# a shell's settings for other work must not decide how many threads the contenders use
+# the shell's own thread settings must not affect the contenders
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 def plain_environment(**more: str) -> dict[str, str]:
-    """This process's environment variables without those that set numbers of threads."""
+    """This process's environment variables without those that set thread counts."""
     kept = {name: value for name, value in os.environ.items() if name not in THREAD_VARIABLES}
     return kept | more
 
 
 def our_environment(**more: str) -> dict[str, str]:
-    """The same, and this checkout comes first for tightrope's processes."""
+    """The same, with this checkout first on tightrope's path."""
     path = os.pathsep.join(filter(None, [str(HERE.parent / "src"), os.environ.get("PYTHONPATH", "")]))
     return plain_environment(PYTHONPATH=path, **more)
 
@@ -49,10 +49,10 @@ def tree_megabytes(pid: int) -> float:
 def run_process(
     command: list[str], environment: dict[str, str], *, watch_memory: bool = False
 ) -> dict[str, float]:
-    """Run a process to its end: wall seconds and peak memory in MB. RuntimeError with its last words.
+    """Run a process to its end: wall seconds and peak memory in MB. RuntimeError with its last output.
 
-    Peak memory is what the system noted for the largest process of the tree; with ``watch_memory`` also the
-    sum over the tree, looked at every 20 ms, if that is more. Watching costs time: never in a timed run.
+    Peak memory is the system's figure for the largest process of the tree or, with ``watch_memory``, the sum
+    over the tree if that is larger, sampled every 20 ms. Watching costs time: never use it in a timed run.
     """
     with tempfile.TemporaryFile("w+") as words:
         begin = time.perf_counter()
@@ -77,7 +77,7 @@ def run_process(
 
 
 def _ended(process: subprocess.Popen) -> bool:
-    """Whether a process has ended, its resources still to be asked for."""
+    """Whether a process has ended, without collecting its resource figures."""
     if not hasattr(os, "waitid"):
         return process.poll() is not None
     return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
@@ -86,7 +86,7 @@ def _ended(process: subprocess.Popen) -> bool:
 def train_ours(
     scenario: dict[str, Any], rollouts: int, *, watch_memory: bool = False, **environment: str
 ) -> dict:
-    """One ``tightrope train`` of that many rollouts' worth of steps, as anyone would start it."""
+    """One normal ``tightrope train`` with as many steps as these rollouts have."""
     total_steps = rollouts * scenario["num_envs"] * scenario["num_steps"]
     with tempfile.TemporaryDirectory() as folder:
         words = report.flags(report.tightrope_settings(scenario) | {"total_steps": total_steps})
@@ -113,7 +113,7 @@ def train_ours(
 def train_peer(
     peer: str, python: str, scenario: dict[str, Any], rollouts: int, *, watch_memory: bool = False
 ) -> dict[str, Any]:
-    """The same of a peer, in its own interpreter."""
+    """The same for a peer, in its own interpreter."""
     total_steps = rollouts * scenario["num_envs"] * scenario["num_steps"]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "result.json"
@@ -127,7 +127,7 @@ def train_peer(
 
 
 def written_by(script: list[str], environment: dict[str, str]) -> Any:
-    """What a script of this folder writes to the result file named last."""
+    """The result that a script of this folder writes to the file in its last argument."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "result.json"
         run_process([*script, str(file)], environment)

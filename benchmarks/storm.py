@@ -1,18 +1,18 @@
-"""Kill storms: a run that is killed again and again, and gone on with each time, ends as one that never was.
+"""Kill storms: a run that is repeatedly killed and resumed ends like an uninterrupted one.
 
     python benchmarks/storm.py --kills 50 --stories cartpole pendulum
     python benchmarks/storm.py --kills 25 --stories language
     python benchmarks/storm.py --cost
 
-Every kill is a SIGKILL, at a moment that a seed draws: some milliseconds after the k-th update of a process,
-or inside a save, which a shim of this script, not of the library, makes slow. Nobody helps in between. The
-storm notes the newest valid checkpoint at each kill and fails unless the resumed process begins there and its
-first new row is the one that follows; when the run is at its end, all that it left is compared: SHA-256 of
-weights, optimiser and normalisers, generators and counters, and every row of every .jsonl file, but for
-``seconds`` and ``time/*``. A run that ends before all kills are spent is followed by another one.
+Every kill is a SIGKILL at a random moment drawn from a seed: some milliseconds after the k-th update of a
+process, or inside a save, which a shim in this script slows down. There is no manual step in between. The
+storm records the newest valid checkpoint at each kill. It fails unless the resumed process begins there and
+its first new row is the next one. At the end of the run all its results are compared: SHA-256 of weights,
+optimiser and normalisers, generators and counters, and every row of every .jsonl file, except ``seconds`` and
+``time/*``. If a run ends before all kills are used, another one follows.
 
-Processes are forked from this one, which has imported the library and never trained: importing it is most of
-the time of a short process, and nothing that a resume may rest on.
+Processes are forked from this one, which has imported the library and never trained: importing takes most of
+the time of a short process, and a resume cannot depend on it.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-SLOW = 0.03  # seconds more for every fsync of a save that is to be killed; a save has half a dozen
-WAIT = 900.0  # seconds for a process to say anything
+SLOW = 0.03  # extra seconds for every fsync of a save that will be killed; a save has half a dozen
+WAIT = 900.0  # seconds a process may stay silent
 CLOCKS = ("seconds", "wall_seconds")
 
 
@@ -43,7 +43,7 @@ CLOCKS = ("seconds", "wall_seconds")
 
 
 def control(env: str, **values: Any) -> Callable[[Path, Any], None]:
-    """A small run on a Gymnasium task, from its start, or gone on with where there is one."""
+    """A small run on a Gymnasium task, started, or resumed if it exists."""
     common = {"num_envs": 4, "num_steps": 64, "seed": 1, "evaluation_episodes": 2, "threads": 1}
 
     def run(folder: Path, report: Any) -> None:
@@ -116,7 +116,7 @@ STORIES: dict[str, Callable[[Path, Any], None]] = {
 
 
 class Process:
-    """A forked process that trains ``folder``; it tells of its start, each update, each save and its end."""
+    """A forked process that trains ``folder``; it reports its start, each update, each save and its end."""
 
     def __init__(self, story: str, folder: Path, slow: bool) -> None:
         ours, theirs = os.pipe()
@@ -128,7 +128,7 @@ class Process:
         self._lines = _lines(ours)
 
     def events(self) -> Iterator[tuple[str, int]]:
-        """(what, step) until the process has ended; RuntimeError when it failed."""
+        """(what, step) until the process has ended; RuntimeError if it failed."""
         for line in self._lines:
             what, step = line.split()
             yield what, int(step)
@@ -137,7 +137,7 @@ class Process:
             raise RuntimeError(f"a process of the storm failed with status {status}; what it said is above")
 
     def kill(self) -> None:
-        """SIGKILL, and wait until it is gone."""
+        """Send SIGKILL and wait for the end."""
         os.kill(self.pid, signal.SIGKILL)
         os.waitpid(self.pid, 0)
 
@@ -148,7 +148,7 @@ def _lines(descriptor: int) -> Iterator[str]:
 
 
 def _live(story: str, folder: Path, slow: bool, out: int) -> int:
-    """The life of a forked process."""
+    """The code that a forked process runs."""
     from tightrope.runs import checkpoint
 
     def tell(what: str, step: int) -> None:
@@ -184,7 +184,7 @@ def _live(story: str, folder: Path, slow: bool, out: int) -> int:
 
 
 def newest(folder: Path) -> int:
-    """The step of the newest valid checkpoint; 0 where there is none."""
+    """The step of the newest valid checkpoint; 0 if there is none."""
     from tightrope.runs import checkpoint
     from tightrope.runs.run import Run
 
@@ -195,7 +195,7 @@ def newest(folder: Path) -> int:
 
 
 def storm(story: str, kills: int, seed: int, deadline: float, base: Path) -> dict[str, Any]:
-    """Kill runs of one story ``kills`` times, or until the deadline; every run that was begun is finished."""
+    """Kill runs of one story ``kills`` times, or until the deadline; every started run is finished."""
     draw = random.Random(f"{story} {seed}")
     whole = base / story / "whole"
     list(Process(story, whole, slow=False).events())
@@ -237,7 +237,7 @@ def planned(draw: random.Random) -> dict[str, Any]:
 
 
 def follow(process: Process, plan: dict[str, Any] | None) -> tuple[dict[str, int], dict[str, Any] | None]:
-    """Watch a process, and kill it as planned: where it began and its first row, and what was killed."""
+    """Watch a process and kill it as planned; returns its first step, its first row and the kill."""
     first, count = dict[str, int](), 0
     for what, step in process.events():
         if what in ("start", "update"):
@@ -249,20 +249,20 @@ def follow(process: Process, plan: dict[str, Any] | None) -> tuple[dict[str, int
             time.sleep(plan["delay"])
             process.kill()
             unread = [line.split()[0] for line in process._lines]
-            # a save that was over when the signal came was none to be killed in
+            # a save that had already ended does not count as a kill inside a save
             return first, {"step": step, "inside": plan["inside"] and "saved" not in unread}
     return first, None
 
 
 def check_first(story: str, begin: int, first: dict[str, int], steps: list[int]) -> None:
-    """Fail unless a process began at the newest checkpoint, and its first row is the one that follows it."""
+    """Fail unless a process began at the newest checkpoint and its first row is the next one."""
     row = next((step for step in steps if step > begin), None)
     if first.get("start", begin) != begin or first.get("update", row) != row:
         raise SystemExit(f"{story}: a resume from checkpoint {begin} began with {first}, expected row {row}")
 
 
 def left(folder: Path) -> dict[str, Any]:
-    """What a finished run leaves: hashes of its tensors and of its state but for clocks, and its rows."""
+    """The results of a finished run: rows, and hashes of tensors and of the state without clock times."""
     from tightrope.runs.run import Run
 
     last = Run.open(folder).newest().folder
@@ -276,12 +276,12 @@ def left(folder: Path) -> dict[str, Any]:
 
 
 def without_clocks(value: Any) -> Any:
-    """A JSON value without what clocks put into it."""
+    """A JSON value without clock times."""
     if isinstance(value, list):
         return [without_clocks(item) for item in value]
     if not isinstance(value, dict):
         return value
-    # a checkpoint keeps how long the files were; rows of other durations have other lengths
+    # a checkpoint stores the lengths of the files, and rows with other durations have other lengths
     kept = {k: v for k, v in value.items() if k not in (*CLOCKS, "records") and not k.startswith("time/")}
     return {k: without_clocks(v) for k, v in kept.items()}
 
@@ -299,7 +299,7 @@ def compare(story: str, wanted: dict[str, Any], found: dict[str, Any]) -> None:
 
 
 def cost(base: Path, steps: int) -> dict[str, Any]:
-    """Seconds of a grid point of CartPole-v1 at default settings: save, sync, and environments anew."""
+    """Seconds of a grid point of CartPole-v1 at default settings: save, sync, and restarted environments."""
     from tightrope.control import train
     from tightrope.control.resolve import resolve
     from tightrope.control.rollout.collector import Collector
@@ -330,7 +330,7 @@ def cost(base: Path, steps: int) -> dict[str, Any]:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run the storms that are asked for, and write what happened."""
+    """Run the requested storms and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--stories", nargs="+", choices=[*STORIES], default=[*STORIES])
     parser.add_argument("--kills", type=int, default=25, help="of each story")
@@ -372,7 +372,7 @@ def write(out: Path | None, found: dict[str, Any]) -> None:
 
 
 def warm(story: str) -> None:
-    """Import what the story's processes need."""
+    """Import everything that the story's processes need."""
     if story == "language":
         import transformers
 

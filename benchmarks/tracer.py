@@ -1,4 +1,4 @@
-"""The way of one update through the files of the package: how often it changes file, and how many it enters.
+"""The path of one update through the files of the package: how often it changes file, and how many it enters.
 
     python benchmarks/tracer.py                                # figures and files of both stories
     python benchmarks/tracer.py control --list                 # and the sequence itself
@@ -12,16 +12,17 @@ Each story is traced at its smallest, in this process, on one thread:
               reward, one epoch, one minibatch. From the first ``forward`` of the model after the run has
               reported its start (the prompt enters) to the optimiser's first ``step``
 
-Everything is done once before it is traced, so that no import is counted. What is counted:
+Everything runs once before it is traced, so that imports do not count. Definitions:
 
-    a file     is where the execution is: that of the innermost running function of the package. What torch,
-               numpy or transformers do in between belongs to the file that called them
-    a call     is counted once for each place that it is made from: a function that is called again by the
-               same caller at the same place, as in a loop, is the same call. What it calls the second time
-               and did not call the first time is added to it, so every loop body is walked through once
-    a change   is a call into another file, or a return to another file; calls within a file are none
+    a file     the file of the innermost running function of the package. Work in torch, numpy or transformers
+               belongs to the file that called them
+    a call     counts once per call site: a function called again by the same caller at the same place, as in
+               a loop, is the same call. New calls that it makes the second time are added to it, so every
+               loop body is traversed once
+    a change   a call into another file, or a return to another file; calls within a file do not count
 
-Other versions of Python may make other calls (from 3.12 on a comprehension is none): compare on one version.
+Other versions of Python may make other calls (from 3.12 on a comprehension is not a call): compare on one
+version.
 """
 
 from __future__ import annotations
@@ -55,21 +56,21 @@ class Call:
 
 
 class Tracer:
-    """Records calls between files below ``package``, from where ``begins`` holds of a frame to ``ends``."""
+    """Records calls between files below ``package``, from the frame where ``begins`` holds to ``ends``."""
 
     def __init__(
         self, package: Path, begins: Callable[[FrameType], bool], ends: Callable[[FrameType], bool]
     ) -> None:
         self.package, self.begins, self.ends = str(package.resolve()) + "/", begins, ends
         self.root = Call("")
-        self.first: list[Call] = []  # the calls that were running at the beginning, the outermost first
+        self.first: list[Call] = []  # the calls that were active at the beginning, the outermost first
         self.last: list[Call] = []  # and at the end
         self._stack: list[tuple[FrameType, Call]] = []
         self._names: dict[CodeType, str | None] = {}
         self.state = "waiting"
 
     def run(self, action: Callable[[], Any]) -> None:
-        """Trace one action. RuntimeError when the beginning or the end was not met."""
+        """Trace one action. RuntimeError if the beginning or the end was not reached."""
         sys.setprofile(self._see)
         try:
             action()
@@ -113,7 +114,7 @@ class Tracer:
         self._stack.append((frame, call.inner.setdefault(key, Call(file, frame.f_code.co_qualname))))
 
     def _file(self, frame: FrameType) -> str | None:
-        """The file of a frame, from the package on; None outside of it."""
+        """The file of a frame, relative to the package; None outside it."""
         code = frame.f_code
         if code not in self._names:
             path = code.co_filename
@@ -140,12 +141,12 @@ class Tracer:
                 yield call.file, call.name
 
     def files(self) -> list[str]:
-        """The files that the execution was in, in order; no two neighbours are the same."""
+        """The executed files, in order; no two neighbours are the same."""
         return collapsed([file for file, _ in self.visits()])
 
 
 def collapsed(names: list[str]) -> list[str]:
-    """Names without those that repeat the one before."""
+    """Names without consecutive repeats."""
     return [name for place, name in enumerate(names) if not place or names[place - 1] != name]
 
 
@@ -158,7 +159,7 @@ def optimiser_steps(frame: FrameType) -> bool:
 
 
 def control() -> Tracer:
-    """One update of PPO on a task of its own."""
+    """One update of PPO on a task of this script."""
     import gymnasium
     import numpy as np
 
@@ -239,7 +240,7 @@ STORIES = {"control": control, "language": language}
 
 
 def figures(tracer: Tracer) -> dict[str, Any]:
-    """What a traced update says: changes of file, the files entered with their sizes, and the sequence."""
+    """The figures of a traced update: changes of file, files entered with their sizes, and the sequence."""
     from code_lines import code_lines
 
     sequence = tracer.files()
@@ -255,7 +256,7 @@ def figures(tracer: Tracer) -> dict[str, Any]:
 
 
 def text(story: str, found: dict[str, Any], listed: bool) -> str:
-    """The figures for people to read."""
+    """The figures as readable text."""
     lines = [
         f"{story}: {found['changes']} changes of file, {found['files']} files entered, "
         f"{found['lines']:,} lines ({found['code']:,} of code)"
@@ -269,7 +270,7 @@ def text(story: str, found: dict[str, Any], listed: bool) -> str:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Trace the stories that are asked for."""
+    """Trace the requested stories."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("stories", nargs="*", metavar="STORY", help="control, language; none: both")
     parser.add_argument("--list", action="store_true", help="print the sequence of files")

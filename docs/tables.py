@@ -1,6 +1,6 @@
-"""Rewrite the tables of docs/control.md that the code owns: python docs/tables.py
+"""Rewrite the generated tables of docs/control.md: python docs/tables.py
 
-A table stands between `<!-- table:NAME -->` and `<!-- end -->`; a test fails when it is out of date.
+A table is between `<!-- table:NAME -->` and `<!-- end -->`; a test fails if it is out of date.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _metric_table(metrics: list[Metric]) -> list[str]:
 
 
 def presets() -> list[str]:
-    """What the presets change for the tasks they know, from control/presets.py."""
+    """The changes of each preset, from control/presets.py."""
     lines = [row("task", "algorithm", "what it changes"), "|---|---|---|"]
     for algorithm, tasks in BY_TASK.items():
         for task, values in tasks.items():
@@ -75,7 +75,7 @@ LANGUAGE_TABLES = {"metrics": language_metrics}
 
 
 def filled(text: str, tables: dict[str, Callable[[], list[str]]] = TABLES) -> str:
-    """The text of a page with every table as the code has it now. ValueError unless each has one place."""
+    """The text of a page with every table updated from the code. ValueError unless each has one place."""
     for name, build in tables.items():
         table = "\n".join([f"<!-- table:{name} -->", "", *build(), "", "<!-- end -->"])
         text, found = re.subn(

@@ -1,4 +1,4 @@
-"""Balance a pole: train, look at single states, save, load, and check what was learned. About ten seconds.
+"""Balance a pole: train, inspect single states, save, load, and check the learned policy. About ten seconds.
 
 python examples/cartpole.py
 """
@@ -24,7 +24,7 @@ def play(agent: tightrope.PPO, seed: int) -> float:
 
 
 def main() -> None:
-    """Train for 60,000 steps and check the policy, also after it has been on disk."""
+    """Train for 60,000 steps and check the policy, before and after a save and load."""
     agent = tightrope.PPO("CartPole-v1", seed=1)
     for report in agent.iterate(60_000):
         if "rollout/ep_rew_mean" in report.metrics:

@@ -1,4 +1,4 @@
-"""Forbidden actions: the environment says what is allowed, all else gets probability 0.
+"""Forbidden actions: the environment returns a mask of allowed actions, all others get probability 0.
 
 python examples/masks.py
 """
@@ -12,7 +12,7 @@ import tightrope
 class Shelf(gymnasium.Env):
     """Take all six items from a shelf. Higher numbers pay more, and sooner is better.
 
-    To take an item that is gone is an error here: without masks nobody could train on this task.
+    Taking an item that is gone is an error here, so training on this task needs masks.
     """
 
     observation_space = gymnasium.spaces.MultiBinary(6)
@@ -33,7 +33,7 @@ class Shelf(gymnasium.Env):
         return self.left.copy(), reward, not self.left.any(), False, {}
 
     def action_masks(self) -> np.ndarray:
-        """True where an action is allowed; info["action_mask"] would do as well."""
+        """True where an action is allowed; info["action_mask"] would work as well."""
         return self.left.astype(bool)
 
 

@@ -1,4 +1,4 @@
-"""An environment of your own: any class with Gymnasium's API; a factory is all that is asked for.
+"""Your own environment: any class with Gymnasium's API; pass the class or another factory.
 
     python examples/own_environment.py
 
@@ -33,7 +33,7 @@ class Corridor(gymnasium.Env):
         self.place = max(0, self.place + (1 if action == 1 else -1))
         self.time += 1
         terminated = self.place == self.length  # no future exists: the task is over
-        truncated = not terminated and self.time >= 50  # the clock stops it, and the future still has a value
+        truncated = not terminated and self.time >= 50  # the time limit stops it; the future still counts
         return self._observation(), (10.0 if terminated else -1.0), terminated, truncated, {}
 
     def _observation(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A network of your own: any torch module that returns action parameters and values.
+"""Your own network: any torch module that returns action parameters and values.
 
 python examples/own_policy.py
 """
@@ -21,7 +21,7 @@ class Residual(nn.Module):
         self.second = nn.Linear(width, width)
         self.actor = nn.Linear(width, outputs)
         self.critic = nn.Linear(width, 1)
-        nn.init.orthogonal_(self.actor.weight, gain=0.01)  # begin with all actions about equally likely
+        nn.init.orthogonal_(self.actor.weight, gain=0.01)  # start with all actions about equally likely
 
     def forward(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Observations [N, D] -> parameters [N, P] (logits, or means of Box actions) and values [N]."""
@@ -31,7 +31,7 @@ class Residual(nn.Module):
 
 
 def build(observation_space, action_space) -> nn.Module:
-    """A function of the spaces serves every task; a module that is already built is taken as well."""
+    """A function of the spaces works for every task; a ready-made module is accepted as well."""
     return Residual(observation_space.shape[0], int(action_space.n))
 
 
@@ -47,7 +47,7 @@ def main() -> None:
     assert returns[-1] > 3 * returns[0]
 
     with tempfile.TemporaryDirectory() as folder:
-        agent.save(Path(folder) / "agent")  # the parameters; the class itself stays in your code
+        agent.save(Path(folder) / "agent")  # saves the parameters; the class stays in your code
         again = tightrope.load(Path(folder) / "agent", policy=build)
     assert again.value([0.0, 0.0, 0.0, 0.0]) == agent.value([0.0, 0.0, 0.0, 0.0])
 

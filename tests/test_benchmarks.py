@@ -1,4 +1,4 @@
-"""The speed benchmark's own arithmetic, with numbers worked out by hand, and the page that it fills."""
+"""The arithmetic of the speed benchmark, against numbers computed by hand, and the page that it fills."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SPEC = spec_from_file_location("benchmark_of_language", BENCHMARKS / "language.p
 assert SPEC is not None and SPEC.loader is not None
 language = module_from_spec(SPEC)
 SPEC.loader.exec_module(language)
-sys.path.remove(str(BENCHMARKS))  # tests have a folder called language, which language.py would hide
+sys.path.remove(str(BENCHMARKS))  # tests/language would be hidden by language.py
 
 SMALL = speed.SCENARIOS[0]
 
@@ -48,7 +48,7 @@ def test_rate_refuses_a_difference_within_the_noise():
 
 
 def test_ratio_is_the_median_over_pairs():
-    """A machine that slows both sides down for a pair leaves the ratio as it is."""
+    """A slowdown of both sides in a pair does not change the ratio."""
     found = report.ratio([100.0, 10.0, 90.0], [10.0, 1.0, 5.0])
     assert found == {"median": 10.0, "low": 10.0, "high": 18.0}
 
@@ -74,7 +74,7 @@ def test_optimiser_steps_round_up():
     (641, False, False),
     (640, True, True),
     (660, True, True),
-    (639, True, False),  # fewer steps than its transitions call for
+    (639, True, False),  # fewer steps than its transitions require
     (1280, True, False),
 ])  # fmt: skip
 def test_work_is_checked(count: int, phantoms: bool, good: bool):
@@ -93,7 +93,7 @@ def test_shares_add_up():
 
 
 def test_flags_are_those_of_the_command_line():
-    """What speed.py says on the command line is read back as the settings it means."""
+    """The command line of speed.py parses to the intended settings."""
     from tightrope.cli.options import training_options
 
     wanted = report.tightrope_settings(SMALL) | {"total_steps": 2048}
@@ -164,7 +164,7 @@ def test_the_report_names_every_figure():
 
 
 def test_the_page_holds_the_committed_figures(tmp_path: Path):
-    """Rendering again changes nothing: no figure was typed, and none is older than its JSON."""
+    """Rendering again changes nothing: no figure was edited by hand, and none is older than its JSON."""
     for page in (speed.PAGE, speed.README):
         text = page.read_text(encoding="utf-8")
         copy = tmp_path / page.name
@@ -187,7 +187,7 @@ def test_pages_of_the_language_story_show_the_committed_results(benchmark, page,
 
 
 def test_the_language_benchmark_runs_the_settings_of_the_demo():
-    """What is timed is what reached the quality that is claimed."""
+    """The timed settings are those that reached the claimed quality."""
     for name in language.MODELS:
         present = language.STAGES[name]["align"]
         timed = language.values_of(name, "one trunk")
@@ -202,7 +202,7 @@ def test_an_interval_is_students():
 
 
 def test_committed_results_are_whole_runs():
-    """A committed file comes from the full benchmark: all scenarios, five pairs or more, a peer beside."""
+    """A committed file comes from the full benchmark: all scenarios, at least five pairs, and a peer."""
     if not speed.RESULTS.exists():
         pytest.skip("no results are committed yet")
     results = json.loads(speed.RESULTS.read_text(encoding="utf-8"))

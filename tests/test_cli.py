@@ -1,6 +1,4 @@
-"""The command line: every setting is a documented flag, every mistake an answer and exit code 2, stdout is
-clean.
-"""
+"""Command line: every setting is a documented flag, mistakes get advice and exit code 2, stdout is clean."""
 
 from __future__ import annotations
 
@@ -67,7 +65,7 @@ def test_every_option_has_help_and_fits_100_columns(make: Any, monkeypatch: pyte
     assert max(map(len, parser.format_help().splitlines())) <= 100
 
 
-def test_every_setting_stands_in_a_named_group() -> None:
+def test_every_setting_is_in_a_named_group() -> None:
     assert "more" not in options.training_parser("train").format_help().split("\n\n")
     listed = [name for names in options.GROUPS.values() for name in names]
     assert sorted(listed) == sorted(flags.settings_fields(TrainSettings))
@@ -95,7 +93,7 @@ CHANGED = {
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("changed", [False, True])
-def test_flags_say_every_setting_and_return_it(algorithm: str, changed: bool) -> None:
+def test_flags_express_every_setting_and_parse_back(algorithm: str, changed: bool) -> None:
     values = (
         {"hidden": (32,), "shared": True, "log_std_init": -0.5, "seed": 7} | CHANGED[algorithm]
         if changed
@@ -229,7 +227,7 @@ def test_a_flag_that_gathers_may_be_repeated() -> None:
     assert parser.read(["--prompt", "a", "--prompt", "b"]) == {"prompt": ["a", "b"]}
 
 
-def test_recipes_say_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
+def test_recipes_list_what_they_leave_out(capsys: pytest.CaptureFixture[str]) -> None:
     text = " ".join(options.training_parser("align").format_help().split())
     assert "without its normalisation of rewards" in text
     assert "without its language-modelling loss on correct responses" in text
@@ -449,7 +447,7 @@ def fake_training(train: Any) -> None:
 
 
 def a_run(folder: Path, stop_at: int | None = None) -> Any:
-    """A training function that reports 100 updates as the real one does, without learning anything."""
+    """A training function that reports 100 updates like the real one, without learning anything."""
     from tightrope.runs.run import Run
 
     def train(settings: TrainSettings, run_dir: str | None, listeners: Any) -> dict[str, Any]:
@@ -517,7 +515,7 @@ def test_quiet_prints_the_end_only(capsys: pytest.CaptureFixture[str], tmp_path:
     assert err == "warning: clip is high\n"
 
 
-def test_ctrl_c_says_how_to_go_on(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_ctrl_c_prints_how_to_resume(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     module = tmp_path / "my_tasks.py"
     module.write_text("")
     folder = tmp_path / "with space"
@@ -572,7 +570,7 @@ def test_help_is_quick_and_needs_no_heavy_package(words: list[str]) -> None:
     seconds = time.perf_counter() - begin
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines()[-1] == "heavy: []"
-    assert seconds < 1.5  # 0.1 s on a quiet machine; the promise is 0.5
+    assert seconds < 1.5  # 0.1 s on an idle machine; the promise is 0.5
 
 
 def test_python_dash_m_is_the_same() -> None:
@@ -589,7 +587,7 @@ def test_python_dash_m_is_the_same() -> None:
 # ---------------------------------------------------------------------------- panel and curves
 
 
-def test_the_panel_paints_seldom_and_shows_where_the_run_stands(tmp_path: Path) -> None:
+def test_the_panel_paints_rarely_and_shows_the_progress_of_the_run(tmp_path: Path) -> None:
     import io
 
     class Terminal(io.StringIO):

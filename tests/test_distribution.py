@@ -1,8 +1,7 @@
-"""What a user installs: the source distribution builds, and its wheel works where nothing else is.
+"""A user's installation: the source distribution builds, and its wheel works in an empty environment.
 
-The environment is empty but for what the wheel itself asks for: of each package that its metadata name, and
-of those that these name, the files of the test environment are linked in. So a dependency that is used and
-not declared is missing there, and no test waits for a download.
+The environment contains only the wheel and its declared dependencies, direct and indirect, linked from the
+test environment. So an undeclared dependency is missing there, and no test waits for a download.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ SOURCES = ("src", "setup.py", "pyproject.toml", "README.md", "LICENSE", "MANIFES
 
 
 def run(command: list[str | Path], where: Path) -> str:
-    """What a command prints, run with none of this environment's settings. It must exit with 0."""
+    """The output of a command, run without this environment's settings. It must exit with 0."""
     clean = {"PATH": "/usr/bin:/bin", "HOME": str(where), "PYTHONDONTWRITEBYTECODE": "1"}
-    clean["PIP_CONFIG_FILE"] = os.devnull  # a constraint of the machine must not decide
+    clean["PIP_CONFIG_FILE"] = os.devnull  # a constraint of the machine must not interfere
     ended = subprocess.run(command, cwd=where, env=clean, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, f"{command}\n{ended.stdout}\n{ended.stderr}"
     return ended.stdout
@@ -52,7 +51,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def needed(requirements: list[str], extras: set[str]) -> dict[str, metadata.Distribution]:
-    """The installed distributions that these requirements name, directly and indirectly."""
+    """The installed distributions behind these requirements, direct and indirect."""
     found: dict[str, metadata.Distribution] = {}
     seen: set[tuple[str, frozenset[str]]] = set()
     waiting = [(line, frozenset(extras)) for line in requirements]
@@ -103,7 +102,9 @@ def test_wheel_and_source_hold_the_package_whole(built: Path):
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         packed = {name.partition("/")[2] for name in archive.getnames()}
     assert {f"src/{name}" for name in sources} | {*SOURCES[1:]} <= packed
-    assert not [name for name in packed if name.startswith("tests/")]  # some of them would be worse than none
+    assert not [
+        name for name in packed if name.startswith("tests/")
+    ]  # a partial set would be worse than none
 
 
 def test_the_index_page_shows_no_link_that_only_works_in_the_repository(built: Path):
@@ -115,7 +116,7 @@ def test_the_index_page_shows_no_link_that_only_works_in_the_repository(built: P
     assert not [target for target in targets if not target.startswith(("https://", "#"))]
     urls = dict(line.split(", ", 1) for line in told.get_all("Project-URL"))
     assert set(urls) == {"Homepage", "Documentation", "Changelog", "Issues"}
-    # every link into the repository names a file or a folder that is there
+    # every link into the repository points to an existing file or folder
     inside = re.findall(re.escape(urls["Homepage"]) + r"/(?:blob|raw)/main/([^)#\s]+)", page)
     assert len(inside) > 10
     assert f"({urls['Homepage']}/raw/main/docs/images/clip.svg)" in page
@@ -141,13 +142,13 @@ def test_the_wheel_trains_evaluates_and_aligns_from_an_empty_environment(environ
     assert (environment / "words" / "model" / "model.safetensors").is_file()
 
 
-# imported by this package, declared by what it comes with
+# imported by this package, declared by another package that brings it
 BROUGHT_BY = {"llvmlite": "numba", "huggingface-hub": "transformers", "mujoco": "gymnasium"}
-OF_THE_USER = {"datasets"}  # a hub data set: the message that it is missing names what to install
+OF_THE_USER = {"datasets"}  # a hub data set: the error names the package to install
 
 
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
-    """Each third party has its line in pyproject.toml: the core's for core files, or an extra's."""
+    """Each third-party package is in pyproject.toml: in the core for core files, or in an extra."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     core = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
     extras = project["optional-dependencies"]
@@ -171,7 +172,7 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
 
 
 def third_parties(path: Path) -> set[str]:
-    """The top names of what a file imports, lazily too, that are neither Python's own nor ours."""
+    """The top-level names of third-party imports of a file, including lazy ones."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -182,7 +183,7 @@ def third_parties(path: Path) -> set[str]:
 
 
 def test_an_undeclared_dependency_would_be_missing(environment: Path):
-    """The environment is empty indeed: what only the tests need is not in it."""
+    """The environment is really empty: packages that only the tests need are missing."""
     python = environment / "env" / "bin" / "python"
     probe = "import importlib.util as u; print([n for n in ('pytest', 'peft', 'mypy') if u.find_spec(n)])"
     assert run([python, "-c", probe], environment).strip() == "[]"

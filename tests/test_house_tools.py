@@ -1,4 +1,4 @@
-"""The measures of the code itself, on cases whose answers are known: lines, imports, calls, hashes."""
+"""The tools that measure the code, on cases with known answers: lines, imports, calls, hashes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def tool(name: str) -> Any:
     spec = importlib.util.spec_from_file_location(f"house_{name}", BENCHMARKS / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
+    sys.modules[spec.name] = module  # dataclasses look up their module
     sys.path.insert(0, str(BENCHMARKS))
     try:
         spec.loader.exec_module(module)
@@ -77,7 +77,7 @@ def test_nothing_is_no_code(source: str):
 
 
 def test_chains_are_counted_anywhere_and_at_the_top(tmp_path: Path):
-    """a > b > c at the top; d is reached by a function alone, e by type checkers alone."""
+    """a > b > c at the top; only a function reaches d, only type checkers reach e."""
     package = written(
         tmp_path,
         a="from toy import b\n",
@@ -101,7 +101,7 @@ def test_chains_are_counted_anywhere_and_at_the_top(tmp_path: Path):
     assert found["chains"]["."]["anywhere"]["files"] == 5
 
 
-def test_a_circle_stands_together(tmp_path: Path):
+def test_a_cycle_is_one_group(tmp_path: Path):
     package = written(
         tmp_path, a="import toy.b\n", b="import toy.c\n", c="import toy.b\nimport toy.d\n", d=""
     )
@@ -165,7 +165,7 @@ def test_a_loop_is_walked_once(tmp_path: Path):
 
 
 def test_what_only_the_second_round_does_is_added(tmp_path: Path):
-    """rare is called by the second act alone: from work to deep and back once more, whatever the number."""
+    """Only the second act calls rare: from work to deep and back once more, for any number of loops."""
     package = written(tmp_path, **TOY)
     first = ["work", "loop", "work", "deep", "work", "deep", "work", "loop"]
     expected = [*first, *["work", "deep", "work", "loop"] * 2]
@@ -173,7 +173,7 @@ def test_what_only_the_second_round_does_is_added(tmp_path: Path):
     assert way(package, 50) == expected
 
 
-def test_a_trace_begins_and_ends_where_it_is_told(tmp_path: Path):
+def test_a_trace_begins_and_ends_at_the_given_frames(tmp_path: Path):
     package = written(tmp_path, **TOY)
     assert way(package, 1, begins="act", ends="generated") == ["work", "deep", "work", "loop"]
     with pytest.raises(RuntimeError, match="waiting"):
@@ -186,7 +186,7 @@ def test_a_trace_begins_and_ends_where_it_is_told(tmp_path: Path):
 
 
 def answer(**changes: Any) -> dict[str, Any]:
-    """What a run left, with a metric of a row, a tensor's bytes or its name changed."""
+    """The results of a run, with a changed metric of a row, or a tensor's changed bytes or name."""
     tensors = {changes.get("name", "newest/policy:w"): changes.get("tensor", "1"), "newest/policy:b": "2"}
     rows = [{"step": 1, "loss": changes.get("loss", 0.5), "seconds": changes.get("seconds", 1.0)}]
     return {
@@ -229,7 +229,7 @@ def test_files_that_are_gone_and_broken_resumes_are_named():
     ]
 
 
-def test_tensors_are_told_apart_by_bytes_shape_and_kind(tmp_path: Path):
+def test_tensors_differ_by_bytes_shape_and_kind(tmp_path: Path):
     import torch
     from safetensors.torch import save_file
 
@@ -250,7 +250,7 @@ def test_the_last_of_a_flag_counts():
 
 
 def test_every_clock_of_the_metrics_is_left_out():
-    """A metric of time or size on disk that is added, and so documented, must be in the ruler's list."""
+    """Every documented metric of time or size on disk must be in the ruler's list."""
     pages = [(BENCHMARKS.parent / "docs" / name).read_text() for name in ("control.md", "rlhf.md")]
     names = {name for page in pages for name in re.findall(r"^\| `(time/\w+)`", page, re.MULTILINE)}
     assert len(names) >= 7 and names <= ruler.CLOCKS, names - ruler.CLOCKS

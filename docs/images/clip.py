@@ -1,7 +1,7 @@
 """Draw the four cases of the clip with the library's own loss: python docs/images/clip.py
 
-Nothing here knows where the clip begins: the curve is `clipped_surrogate`, and its colour is the gradient
-that torch derives from it.
+The clip's position is not coded here: the curve is `clipped_surrogate`, and its colour is the gradient that
+torch derives from it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def objective(advantage: float) -> tuple[list[float], list[float], list[bool]]:
 
 
 def text(x: float, y: float, words: str, size: int = 13, colour: str = INK, **more: str) -> str:
-    """One line of text, centred unless ``text_anchor`` says otherwise."""
+    """One line of text, centred unless ``text_anchor`` is given."""
     options = {"text-anchor": "middle", **{name.replace("_", "-"): value for name, value in more.items()}}
     extra = "".join(f' {name}="{value}"' for name, value in options.items())
     return f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size}" fill="{colour}"{extra}>{words}</text>'

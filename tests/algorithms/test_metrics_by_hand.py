@@ -1,4 +1,4 @@
-"""Every metric of an update by hand: two rows of two steps, of which one step does not count."""
+"""Every metric of an update, computed by hand: two rows of two steps, one of them masked."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings
 
 MASK = torch.tensor([[True, True], [True, False]])
-RATIOS = [1.5, 1.1, 1.3]  # all above 1, which is what a masked step would say
+RATIOS = [1.5, 1.1, 1.3]  # all above 1, the ratio of a masked step
 ADVANTAGES = [2.0, -1.0, 0.5]
 VALUES, RETURNS, ENTROPIES = [0.0, 1.0, 3.0], [1.0, 1.0, 1.0], [0.2, 0.3, 0.7]
 
@@ -22,7 +22,7 @@ def spread(numbers):
 
 
 def of_rule(rule, settings, **more):
-    """The metrics of one update of a model that says the same whatever its parameter is."""
+    """The metrics of one update of a model whose output does not depend on its parameter."""
     weight = torch.nn.Parameter(torch.zeros(()))
 
     def model(part):
@@ -79,7 +79,7 @@ def test_every_metric_of_an_update_by_hand(rule, settings, own, micro):
 
 @pytest.mark.parametrize(("rule", "settings", "own"), RULES, ids=["ppo", "a2c", "reinforce"])
 def test_a_metric_of_an_extra_loss_may_be_a_mean_over_other_things_than_steps(rule, settings, own):
-    """Two parts: 10 of 1 thing and 20 of 4 things are 6 a thing, whatever the steps beside them."""
+    """Two parts: sums of 10 over 1 item and 20 over 4 items give a mean of 6, independent of the steps."""
     given = iter([(torch.tensor(10.0), 1), (torch.tensor(20.0), 4)])
 
     def extra(model, part, evaluation, count):

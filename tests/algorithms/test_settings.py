@@ -1,4 +1,4 @@
-"""Settings are checked where they are made, and fall along their schedules."""
+"""Settings are checked when they are created, and fall along their schedules."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The update rules: what one step is, what several epochs add, and what stops them."""
+"""The update rules: a single step, several epochs, and the stops."""
 
 import copy
 import dataclasses
@@ -96,7 +96,7 @@ def test_nan_behind_the_mask_changes_nothing(rule, settings):
 
 
 @pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
-def test_nan_that_a_model_says_behind_the_mask_changes_nothing(rule, settings):
+def test_nan_from_a_model_behind_the_mask_changes_nothing(rule, settings):
     class Babbling(TinyModel):
         def forward(self, batch):
             now = super().forward(batch)
@@ -124,7 +124,7 @@ def test_a_batch_of_which_no_step_counts_is_refused(rule, settings, columns):
 
 @pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
 def test_a_row_of_which_no_step_counts_changes_nothing(rule, settings):
-    """Also where it would be a minibatch or a part of its own, whose mean is over nothing."""
+    """Even if it would form its own minibatch or part, with a mean over nothing."""
     batch = make_batch(TinyModel(), rows=6, columns=3)
     kept = torch.tensor([0, 2, 3, 5])
     mask = batch.mask.clone()
@@ -136,7 +136,7 @@ def test_a_row_of_which_no_step_counts_changes_nothing(rule, settings):
     assert torch.equal(weights(some), weights(alone)) and metrics == expected
 
 
-def test_advantages_that_are_estimated_anew_must_count_too():
+def test_recomputed_advantages_must_count_too():
     def nothing(batch):
         return dataclasses.replace(batch, mask=torch.zeros_like(batch.mask))
 
@@ -188,7 +188,7 @@ def test_kl_stop_is_decided_before_the_step_and_ends_all_epochs():
     assert distance(model, again) < 1e-5
 
 
-def test_a_nan_gradient_takes_no_step_and_says_so():
+def test_a_nan_gradient_takes_no_step_and_is_reported():
     batch = make_batch(TinyModel())
     batch = dataclasses.replace(
         batch, advantages=batch.advantages.index_fill(0, torch.tensor([3]), torch.nan)
@@ -202,7 +202,7 @@ def test_a_nan_gradient_takes_no_step_and_says_so():
 
 
 def test_the_fused_adam_skips_a_refused_step_by_itself():
-    """What an accelerator relies on: found_inf leaves weights and moments as they are."""
+    """Accelerators rely on it: found_inf leaves weights and moments unchanged."""
     parameter = torch.nn.Parameter(torch.ones(3))
     optimiser = torch.optim.Adam([parameter], fused=True)
     parameter.grad = torch.full((3,), 2.0)
@@ -253,8 +253,8 @@ def test_extra_loss_joins_the_loss_and_its_metrics():
 
 @pytest.mark.parametrize(("rule", "settings"), RULES, ids=["ppo", "a2c", "reinforce"])
 @pytest.mark.parametrize("micro", [None, 1, 5, 24])
-def test_extra_loss_is_told_the_count_of_the_whole_minibatch(rule, settings, micro):
-    """With it a loss that is a sum over steps has the scale of the rest, and micro-batches change nothing."""
+def test_extra_loss_gets_the_count_of_the_whole_minibatch(rule, settings, micro):
+    """It gives a summed loss the scale of the other terms, so that micro-batches change nothing."""
     batch = make_batch(TinyModel(), rows=24, columns=3, masked=0.4)
     counts = []
 

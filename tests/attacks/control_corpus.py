@@ -1,4 +1,4 @@
-"""Attacks on a run folder of ``tightrope train``, played on every command that reads one."""
+"""Attacks on a run folder of ``tightrope train``, run against every command that reads one."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ TERMINAL = json.dumps({"pid": 1, "host": "\x1b[2J", "started": "\x9b2J"})
 
 
 def mark(size: int) -> dict[str, Any]:
-    """What a checkpoint counts on in a record file, of that size."""
+    """A record file of that size, on which a checkpoint relies."""
     return {"metrics.jsonl": {"bytes": size}}
 
 
@@ -89,7 +89,7 @@ def attacks() -> list[Attack]:
     for name in CHECKPOINT:
         found.append(Attack(f"pickle as {name}", put(f"*/{name}", pickled()), name))
         found.append(Attack(f"{name} is a link in a checkpoint", link(f"*/{name}", "elsewhere"), "is a link"))
-    for name in CHECKPOINT[1:]:  # signed anew: the hashes agree, it is the content that is refused
+    for name in CHECKPOINT[1:]:  # hashed again: the hashes agree, so the content itself is refused
         words = "is not readable as JSON" if name == "state.json" else f"{name} is not a safetensors file"
         found.append(Attack(f"forged pickle as {name}", forge_file(name, pickled()), words))
     for name in ("policy.pt", "optimizer.pt", "training_args.bin", "weights.zip", "checkpoint.pkl"):

@@ -1,7 +1,7 @@
-"""Hostile files, made by code: what somebody could put into a run, a checkpoint or a model folder.
+"""Hostile files, made by code: attacks that somebody could put into a run, a checkpoint or a model folder.
 
-Each attack has a name, a function that plants it in a good folder, and the words that its refusal must hold
-(None: it is harmless, and the command does its work as if it were not there).
+Each attack has a name, a function that plants it in a good folder, and the words that its refusal must
+contain (None: it is harmless, and the command works as if it were not there).
 """
 
 from __future__ import annotations
@@ -73,13 +73,13 @@ def torch_zip() -> bytes:
     return file.getvalue()
 
 
-HUGE = struct.pack("<Q", 10 * 2**30) + b'{"a":'  # safetensors with a header of 10 GB, as it says
+HUGE = struct.pack("<Q", 10 * 2**30) + b'{"a":'  # safetensors that declares a header of 10 GB
 DEEP = b"[" * 200_000
 MODULE = f"import os\n{CODE}\ndef function(*_, **__): return [0.0]\nclass Model: pass\n"
 
 
 def put(name: str, content: bytes | str) -> Callable[[Path], None]:
-    """Write a file below the folder; ``*`` stands for the newest checkpoint."""
+    """Write a file below the folder; ``*`` means the newest checkpoint."""
 
     def plant(folder: Path) -> None:
         path = found(folder, name)
@@ -172,7 +172,7 @@ def declare(name: str) -> Callable[[Path], None]:
 
 
 def twice(name: str, key: str, value: str) -> Callable[[Path], None]:
-    """A key that stands twice, with another value the second time."""
+    """A duplicate key with a different second value."""
 
     def plant(folder: Path) -> None:
         path = found(folder, name)
@@ -183,7 +183,7 @@ def twice(name: str, key: str, value: str) -> Callable[[Path], None]:
 
 
 def link(name: str, target: str) -> Callable[[Path], None]:
-    """A link in the place of a file or folder, to ``target`` beside the run: what it held, or a victim."""
+    """A link instead of a file or folder, to ``target`` beside the run: the old content, or a victim."""
 
     def plant(folder: Path) -> None:
         path, elsewhere = found(folder, name), folder.parent / target
@@ -197,7 +197,7 @@ def link(name: str, target: str) -> Callable[[Path], None]:
 
 
 def pipe(name: str) -> Callable[[Path], None]:
-    """A named pipe: whoever reads it waits for ever."""
+    """A named pipe: a reader waits for ever."""
 
     def plant(folder: Path) -> None:
         found(folder, name).unlink(missing_ok=True)

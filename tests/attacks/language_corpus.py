@@ -1,4 +1,4 @@
-"""Attacks on model folders, adapters and runs of sft, reward and align, played on what reads them."""
+"""Attacks on model folders, adapters and runs of sft, reward and align, run against their readers."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def of_models() -> list[Attack]:
 
 
 def of_judges() -> list[Attack]:
-    """On a reward model; of what is harmless, which costs a whole run, only what its own loader may read."""
+    """On a reward model; of the harmless ones, which cost a whole run, only those for its own loader."""
     return [a for a in of_models() if a.words is not None or a.name == "pickle beside, pytorch_model.bin"]
 
 
@@ -202,7 +202,7 @@ def of_supervised() -> list[Attack]:
 
 
 def cases(place: Path) -> Iterator[tuple[str, str, Path, Attack, Callable[[Path], Any]]]:
-    """Group, command, good folder, attack and call for everything there is to play."""
+    """Group, command, good folder, attack and call for every attack."""
     from tightrope.cli.main import main
 
     model, prompts, chats = (str(place / name) for name in ("model", "prompts.jsonl", "chats.jsonl"))

@@ -1,7 +1,7 @@
-"""Whole commands in a process that hears from its very beginning what they do: honest lives of both stories.
+"""Whole commands in a process that is audited from its start: normal runs of control and language.
 
-The place, the folders, the texts and the names in them hold MARK: nothing of them can be compiled, executed
-or imported unheard. Only files that the words of a command name may run, and only in that command.
+The place, the folders, the texts and the names in them contain MARK: nothing of them can be compiled,
+executed or imported unnoticed. Only files that a command line names may run, and only in that command.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def run(*words: Any) -> dict[str, Any]:
 
 
 def control() -> dict[str, Any]:
-    """Both engines, worker processes, a task of one's own."""
+    """Both engines, worker processes, a custom task."""
     life, again, own = (PLACE / f"{MARK}-{name}" for name in ("life", "again", "own"))
     tasks = PLACE / f"{MARK}_tasks.py"
     tasks.write_text(TASKS)
@@ -99,7 +99,7 @@ def spawned() -> dict[str, Any]:
 
 
 def language() -> dict[str, Any]:
-    """The three stages, each resumed, and a reward function of one's own."""
+    """The three stages, each resumed, and a custom reward function."""
     from language.tiny import saved, tiny_llama
 
     saved(PLACE / "model", tiny_llama(1), chat=True)
@@ -134,7 +134,7 @@ def language() -> dict[str, Any]:
 
 @contextlib.contextmanager
 def spied(calls: list[dict[str, Any]]) -> Iterator[None]:
-    """Inside, what every from_pretrained of transformers' Auto classes is told is noted."""
+    """Inside, the arguments of every from_pretrained of transformers' Auto classes are recorded."""
     import transformers
 
     with contextlib.ExitStack() as stack:
@@ -151,7 +151,7 @@ def spied(calls: list[dict[str, Any]]) -> Iterator[None]:
 
 
 def play(story: str) -> dict[str, Any]:
-    """The outcomes of a story by command, and what was heard beside them."""
+    """The outcomes of a story by command, and the audited events."""
     calls: list[dict[str, Any]] = []
     with spied(calls) if story == "language" else contextlib.nullcontext():
         commands = {"control": control, "spawned": spawned, "language": language}[story]()

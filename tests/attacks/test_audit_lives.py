@@ -1,5 +1,5 @@
-"""Lives of whole commands under an audit hook: what runs is installed or was named by the user, and what is
-unpickled falls under one of the two exceptions of the design.
+"""Whole commands under an audit hook: all executed code is installed or named by the user, and all unpickling
+falls under one of the two exceptions of the design.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ def language(tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 
 def check_lives(found: dict) -> None:
-    """Every command did its work and ran nothing else; only those that lack a name were refused."""
+    """Every command did its work and ran nothing else; only those without a name were refused."""
     for name, result in found["commands"].items():
         check_safe(result, megabytes=4000)
         assert result["code"] == (2 if "unnamed" in name else 0), (name, result["text"])
 
 
-def test_a_life_of_control_unpickles_compiled_code_alone(control: dict):
+def test_a_life_of_control_unpickles_only_compiled_code(control: dict):
     found = control["control"]
     check_lives(found)
     assert {line.partition(":")[0] for line in found["excepted"]} <= {"cache"}
@@ -43,7 +43,7 @@ def test_a_spawned_worker_unpickles_the_factory_when_it_starts_and_nothing_later
     assert found["excepted"] == found["imported"] == []
 
 
-def test_a_life_of_language_unpickles_nothing_and_trusts_nobody(language: dict):
+def test_a_life_of_language_unpickles_nothing_and_trusts_no_remote_code(language: dict):
     check_lives(language)
     assert language["excepted"] == language["workers"] == []
     assert language["imported"] == [f"{MARK}_judge.py"]  # --reward
@@ -55,7 +55,7 @@ def test_a_life_of_language_unpickles_nothing_and_trusts_nobody(language: dict):
     assert all(call["use_safetensors"] is True for call in calls if "ModelFor" in call["kind"])
 
 
-def test_code_of_ones_own_is_asked_for_again_with_the_command_to_type(control: dict, language: dict):
+def test_user_code_must_be_named_again_and_the_command_is_printed(control: dict, language: dict):
     found, place = control["spawned"]["commands"], control["place"]
     for command in ("evaluate", "resume"):
         text = found[f"{command} unnamed"]["text"]

@@ -1,4 +1,4 @@
-"""Whatever lies in a run folder: no code of it runs, nothing is written elsewhere, what is wrong is said."""
+"""Hostile run folders: none of their code runs, nothing is written elsewhere, and errors name the problem."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ATTACKS = {attack.name: attack for attack in control_corpus.attacks()}
 
 
 def played(module: str, place: Path, *words: str) -> dict:
-    """The outcomes of a corpus or of lives. In a process of its own: an audit hook never goes."""
+    """The outcomes of a corpus or of lives, in a separate process: an audit hook cannot be removed."""
     (place / "cwd").mkdir(exist_ok=True)
     canary = str(place / "canary")
     source = corpus.MODULE.replace(repr(corpus.CANARY), repr(canary))
@@ -36,7 +36,7 @@ def played(module: str, place: Path, *words: str) -> dict:
 
 
 def check_safe(result: dict, *, megabytes: float = 200) -> None:
-    """No code ran, nothing was written beside, and the end was a success or one clean error.
+    """No code ran, nothing was written elsewhere, and the end was a success or one clean error.
 
     ``megabytes``: those of attacks are small files, of which one declares 10 GB.
     """
@@ -121,8 +121,8 @@ print(json.dumps(found))
 """
 
 
-def test_payloads_fire_where_nobody_is_careful_and_the_watch_hears_them(tmp_path: Path):
-    """The corpus could fail."""
+def test_payloads_fire_in_careless_code_and_the_watch_detects_them(tmp_path: Path):
+    """The corpus can fail."""
     tests = Path(__file__).parents[1]
     path = os.pathsep.join(map(str, (tests, tests.parent / "src")))
     more = {"TIGHTROPE_CANARY": str(tmp_path / "canary"), "PYTHONPATH": path, "HF_HOME": str(tmp_path / "hf")}

@@ -1,4 +1,4 @@
-"""Whatever lies in a model folder, an adapter or a run of the language story: no code of it runs."""
+"""Hostile model folders, adapters and language runs: none of their code runs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_an_attack_is_harmless_or_refused(results: dict, name: str):
 
 
 def test_a_chat_template_is_run_in_a_sandbox(results: dict):
-    """A template is a program; what it may not reach is an error of the data."""
+    """A template is a program; forbidden access is a data error."""
     result = results["template: template"]["chat"]
     check_safe(result)
     assert result["code"] == 2 and "the chat template refuses" in result["text"]

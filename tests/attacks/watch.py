@@ -1,13 +1,13 @@
-"""An audit hook that tells code which came out of a file from code of installed libraries.
+"""An audit hook that distinguishes code from a hostile file from code of installed libraries.
 
-Every hostile file names one module, MARK, which lies where Python would find it. Whatever imports it,
-compiles or executes a text that holds the name, runs a file below the place of the test, unpickles an object,
-starts a program or opens a connection is recorded. Libraries import modules of their own late and execute
-code that they have generated themselves; neither holds the name.
+Every hostile file names one module, MARK, which Python would find. The hook records every import of it, every
+compilation or execution of a text with that name, every file run below the place of the test, every unpickled
+object, every started program and every connection. Libraries import their own modules late and execute code
+that they generate; neither contains the name.
 
-Strict, for lives in which every command does its work: code runs only out of files that are installed or
-were named on the command line, or is a text that an installed library wrote; that text and what is imported
-hold no word of the data, each of which holds MARK.
+Strict mode, for lives in which every command does its work: code may only come from files that are installed
+or named on the command line, or be a text that an installed library wrote. That text and the imports must not
+contain a word of the data, each of which contains MARK.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Watch:
     def _hear(self, event: str, arguments: tuple[Any, ...]) -> None:
         if not self.armed:
             return
-        self.armed = False  # what is done here is not heard
+        self.armed = False  # this is not audited
         try:
             if event == "pickle.find_class" and (exception := _exception()):
                 self._note(self.excepted, f"{exception}: {'.'.join(map(str, arguments))}")
@@ -67,7 +67,7 @@ class Watch:
             self.armed = True
 
     def record(self, text: str) -> None:
-        """Note what no audit event tells of."""
+        """Record what no audit event covers."""
         armed, self.armed = self.armed, False
         self._note(self.events, text)
         self.armed = armed
@@ -80,7 +80,7 @@ class Watch:
                 file.write(text + "\n")
 
     def forbid_pickle(self) -> contextlib.AbstractContextManager[None]:
-        """Inside, every pickle is noted that is read or sent between processes, whatever it holds."""
+        """Inside, every pickle that is read or sent between processes is recorded."""
 
         def noted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
             def call(*arguments: Any, **more: Any) -> Any:
@@ -116,7 +116,7 @@ class Watch:
         return ""
 
     def _executed(self, code: Any) -> str:
-        """What is wrong with code that begins to run."""
+        """The problem with code that begins to run."""
         file = code.co_filename
         if file in self.allowed:
             return ""
@@ -131,7 +131,7 @@ class Watch:
 
 
 def _runner() -> str:
-    """The file of whoever asked for what is judged."""
+    """The file of the caller behind an event."""
     frame = sys._getframe(1)
     while frame is not None and frame.f_code.co_filename == __file__:
         frame = frame.f_back

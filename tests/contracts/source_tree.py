@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 SRC = ROOT / "src" / "tightrope"
-# what tools leave behind, and what .gitignore keeps out of the repository
+# files that tools create, and files that .gitignore excludes
 LEFT_OUT = {"__pycache__", "runs", "build", "dist", "node_modules"}
 KEPT = {SRC / "runs", ROOT / "tests" / "runs"}
 
 
 def files(*suffixes: str, under: Path = ROOT) -> list[Path]:
-    """Files of the repository with one of these endings (none: all), sorted; caches and runs left out."""
+    """Files of the repository with one of these endings (none: all), sorted, without caches and runs."""
 
     def walk(folder: Path) -> Iterator[Path]:
         for path in sorted(folder.iterdir()):
@@ -55,7 +55,7 @@ def module_of(path: Path) -> str:
 
 
 def imports(module: ast.Module, name: str, *, package: bool = False) -> Iterator[tuple[int, str]]:
-    """Line and full name of everything a module imports, wherever it stands; relative ones made absolute."""
+    """Line and full name of every import of a module, at any depth; relative ones made absolute."""
     home = name.split(".") if package else name.split(".")[:-1]
     for node in ast.walk(module):
         if isinstance(node, ast.Import):
@@ -69,7 +69,7 @@ def imports(module: ast.Module, name: str, *, package: bool = False) -> Iterator
 
 
 class Block(NamedTuple):
-    """A fenced block of a page: its language, text and the line its text begins at."""
+    """A fenced block of a page: its language, its text and the first line of its text."""
 
     language: str
     text: str
@@ -77,7 +77,7 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    """The fenced blocks of a Markdown page, in order. ValueError when a fence is not closed."""
+    """The fenced blocks of a Markdown page, in order. ValueError if a fence is not closed."""
     found: list[Block] = []
     language, start, lines = "", 0, None
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):

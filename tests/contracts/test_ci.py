@@ -1,4 +1,4 @@
-"""What a change must pass is what the README says, on packages that are pinned where it matters."""
+"""A change must pass the commands of the README, on packages that are pinned where it matters."""
 
 from __future__ import annotations
 

@@ -1,22 +1,22 @@
-"""The docs are run: every command and every snippet of the README and of docs/, and every quotation compared.
+"""Runs the docs: every command and snippet of the README and of docs/; and compares every quotation.
 
-What happens to a fenced block, by its language:
+The check of a fenced block depends on its language:
 
-    python   begins with `# src/...`  must stand in that file, line for line, whatever the indentation
-             holds `>>>`              is run by doctest; the answers must be those on the page
-             else                     is run as it stands, after the blocks before it on the page; at
-                                      path/to/model lies a tiny one, and 4096 episodes become 64
-    sh       tightrope ...            is run; TRAINING is added to train, and RESUMING to resume, so that
-                                      it takes seconds
-             make TARGET              the Makefile must have the target (to run it would run this test again)
-             python FILE              the file must be there; examples/ are run by test_examples.py
-             pip install, venv        the extras that are named must exist
-             anything else            fails: write a rule for it, or take it out
-    console  `$ command`              is run as it stands, must exit with 2 and print the lines below it
-    diff     two files                - lines stand in the first, + lines in the second, others in both
-    text     nothing (maps are checked by test_readme_tree.py)
+    python   begins with `# src/...`  must match that file, line for line, at any indentation
+             contains `>>>`           is run by doctest; the results must be those on the page
+             else                     is run unchanged, after the earlier blocks of the page; path/to/model
+                                      is a tiny model, and 4096 episodes become 64
+    sh       tightrope ...            is run; TRAINING is added to train and RESUMING to resume, so that it
+                                      takes seconds
+             make TARGET              the Makefile must have the target (running it would run this test again)
+             python FILE              the file must exist; test_examples.py runs examples/
+             pip install, venv        the named extras must exist
+             anything else            fails: write a rule for it, or remove it
+    console  `$ command`              is run unchanged, must exit with 2 and print the lines below it
+    diff     two files                - lines are in the first, + lines in the second, others in both
+    text     nothing (test_readme_tree.py checks maps)
 
-Blocks of a page share a folder that is empty at first, but for a copy of examples/.
+The blocks of a page share a folder that starts with only a copy of examples/.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ QUOTED = re.compile(r"# (src/\S+\.py)\n")
 
 
 def lines_of(block: Block) -> list[str]:
-    """The commands of a shell block: comments and empty lines left out."""
+    """The commands of a shell block, without comments and empty lines."""
     lines = [line.partition(" #")[0].strip() for line in block.text.replace("\\\n", " ").splitlines()]
     return [line for line in lines if line and not line.startswith("#")]
 
 
 def run(words: list[str]) -> tuple[int, str]:
-    """Exit code and output of a tightrope command; tasks it registers are forgotten, as with a process."""
+    """Exit code and output of a tightrope command; tasks that it registers are removed afterwards."""
     printed, known = io.StringIO(), set(gymnasium.registry)
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         try:
@@ -91,7 +91,7 @@ def run_command(line: str) -> None:
 
 
 def replaced(words: list[str], more: list[str]) -> list[str]:
-    """A command with flags and values added, in place of those it gives itself."""
+    """A command with flags and values added; they replace its own."""
     own = {i for i, word in enumerate(words) if word in more[::2]}
     return [word for i, word in enumerate(words) if not {i, i - 1} & own] + more
 
@@ -121,12 +121,12 @@ def run_python(block: Block, page: Path, names: dict[str, Any]) -> None:
         from language.tiny import saved, tiny_llama
 
         saved(Path("path/to/model"), tiny_llama())
-        text = text.replace("total_episodes=4096", "total_episodes=64")  # the length alone is another
+        text = text.replace("total_episodes=4096", "total_episodes=64")  # only the length differs
     exec(compile(padding + text, str(page), "exec"), names)
 
 
 def stands_in(quoted: str, text: str) -> bool:
-    """Whether lines stand together in a text, at whatever indentation; `...` alone skips lines."""
+    """Whether lines are adjacent in a text, at any indentation; a line with only `...` skips lines."""
     whole = text.splitlines()
     for chunk in re.split(r"^\s*\.\.\.\s*\n", quoted, flags=re.MULTILINE):
         lines = dedented(chunk.splitlines())
@@ -137,14 +137,14 @@ def stands_in(quoted: str, text: str) -> bool:
 
 
 def dedented(lines: list[str]) -> list[str]:
-    """Lines without the indentation that they share."""
+    """Lines without their common indentation."""
     depth = min((len(line) - len(line.lstrip()) for line in lines if line.strip()), default=0)
     return [line[depth:].rstrip() for line in lines]
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An empty folder to run a page in, with the examples; modules that a page imports do not stay."""
+    """A folder with only the examples, to run a page in; modules that the page imports are removed."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
@@ -190,7 +190,7 @@ def test_quotations_are_compared_line_by_line():
 
 @pytest.mark.parametrize("page", pages(), ids=name_of)
 def test_diffs_are_true(page: Path):
-    """Every line of a shown diff stands in the file it is said to be from, a changed one in no other."""
+    """Every line of a diff is in its file; a changed line is not in the other one."""
     for block in (b for b in blocks(page) if b.language == "diff"):
         first, second, *lines = block.text.splitlines()
         texts = [(ROOT / line[4:]).read_text(encoding="utf-8") for line in (first, second)]

@@ -1,4 +1,4 @@
-"""The examples run as a user runs them, and what they assert holds."""
+"""The examples run as a user runs them, and their assertions hold."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EXAMPLES = files(".py", under=ROOT / "examples")
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=name_of)
 def test_example(path: Path, tmp_path: Path):
-    """Without a warning, in another folder, leaving nothing behind."""
+    """Runs without a warning, in another folder, and leaves no files."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     command = [sys.executable, "-W", "error::UserWarning", str(path)]
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""Each option says what it does, what its default is, and its range where it has one."""
+"""Each option documents its effect, its default and, if it has one, its range."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OPTIONS = [
 
 @pytest.mark.parametrize("action", OPTIONS)
 def test_every_option_states_its_default(action: argparse.Action):
-    """A switch that is off unless given needs no word; everything that takes a value does."""
+    """A switch that is off by default needs no default text; every option with a value does."""
     text = action.help or ""
     assert len(text) > 10, "no help"
     if action.nargs != 0 or isinstance(action, argparse.BooleanOptionalAction):

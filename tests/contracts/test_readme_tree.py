@@ -1,4 +1,4 @@
-"""The README's map is the disk: everything listed exists, every folder of the package is listed."""
+"""The README's map matches the disk: everything listed exists, every folder of the package is listed."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_every_line_explains():
 
 @pytest.mark.parametrize("page", pages(), ids=name_of)
 def test_links_lead_somewhere(page: Path):
-    """Files and headings that a page links to exist."""
+    """The files and headings that a page links to exist."""
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
         if target.startswith(("http://", "https://")):
             continue

@@ -1,4 +1,4 @@
-"""Every setting is read by the code that it promises to steer, and every one explains itself."""
+"""Every setting is read by the code that it claims to control, and every one is documented."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 
 KINDS = (TrainSettings, UpdateSettings, *ALGORITHM_SETTINGS.values())
 FIELDS = sorted({field.name for kind in KINDS for field in dataclasses.fields(kind)})
-# where settings are declared, checked, preset or put on the command line: being read there proves nothing
+# where settings are declared, checked, preset or made flags: reading them there proves nothing
 DECLARED_IN = {
     SRC / name
     for name in (
@@ -28,7 +28,7 @@ DECLARED_IN = {
 
 
 def attributes_read() -> set[str]:
-    """Every ``x.name`` that is read, and not called, in the rest of the package."""
+    """Every ``x.name`` that the rest of the package reads and does not call."""
     found = set()
     for path in sources():
         if path in DECLARED_IN:
@@ -50,7 +50,7 @@ def test_every_setting_is_read(name: str):
 
 @pytest.mark.parametrize("name", [name for name in FIELDS if name.endswith("_schedule")])
 def test_every_schedule_moves_its_setting(name: str):
-    """Schedules are read by their ending: half-way, a linear one has halved what it is named after."""
+    """Schedules are read by their suffix: half-way, a linear one has halved its setting."""
     kind = next(k for k in KINDS[1:] if name in {f.name for f in dataclasses.fields(k)})
     base = name.removesuffix("_schedule")
     settings = kind(**{name: "linear", base: 0.1})
@@ -68,7 +68,7 @@ def test_every_setting_explains_itself(kind: type):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_settings_are_frozen_data(kind: type):
-    """Nothing fills a field in while the program runs."""
+    """Nothing fills a field at run time."""
     settings = kind()
     with pytest.raises(dataclasses.FrozenInstanceError):
         settings.gamma = 0.5

@@ -1,4 +1,4 @@
-"""Code that fits on a screen: budgets for files, functions, nesting and lines of the package."""
+"""Code that fits on a screen: limits for files, functions, nesting and lines of the package."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 from source_tree import name_of, sources, tree
 
 FILE, FUNCTION, NESTING, LINE = 500, 60, 4, 110
-SMELL = 350  # lines of a file: ask whether it has one reason to exist, and never split it for the number
-# A ratchet: "path" or "path:function" -> (what it may have, why). An entry that is no longer needed fails.
+SMELL = 350  # lines of a file: ask whether it has one reason to exist; never split it only for the number
+# A ratchet: "path" or "path:function" -> (its limit, the reason). An entry that is no longer needed fails.
 EXCEPTIONS: dict[str, tuple[int, str]] = {}
 
 BLOCKS = (ast.If, ast.For, ast.While, ast.With, ast.Try, ast.Match)
@@ -23,7 +23,7 @@ def functions(module: ast.Module) -> list[ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def length(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of a function, its docstring left out: explaining must not cost anything."""
+    """Lines of a function without its docstring: documentation must not count."""
     lines = (function.end_lineno or function.lineno) - function.lineno + 1
     first = function.body[0]
     if ast.get_docstring(function) is not None:
@@ -32,7 +32,7 @@ def length(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def nesting(node: ast.AST) -> int:
-    """How many blocks stand inside each other at the deepest place; ``elif`` is no block of its own."""
+    """The deepest nesting of blocks; ``elif`` does not count as its own block."""
     deepest = 0
     for child in ast.iter_child_nodes(node):
         if isinstance(child, (*FUNCTIONS, ast.ClassDef)):
@@ -43,7 +43,7 @@ def nesting(node: ast.AST) -> int:
 
 
 def measured(measure: Callable[[Any], int]) -> dict[str, int]:
-    """A measure of every function, by file and name; the largest where a file has a name twice."""
+    """A measure of every function, by file and name; the largest if a file has a name twice."""
     sizes: dict[str, int] = {}
     for path in sources():
         for function in functions(tree(path)):
@@ -53,7 +53,7 @@ def measured(measure: Callable[[Any], int]) -> dict[str, int]:
 
 
 def check(sizes: dict[str, int], budget: int, unit: str) -> None:
-    """Fail for everything above its budget, and for exceptions that are wider than what they excuse."""
+    """Fail for everything above its limit, and for exceptions that are larger than necessary."""
     too_big = [
         f"{name}: {size} {unit}, at most {budget}"
         for name, size in sizes.items()
@@ -89,7 +89,7 @@ def test_lines():
     assert not too_long, "\n".join(too_long)
 
 
-def test_the_measure_counts_as_said():
+def test_the_measure_counts_as_documented():
     code = 'def f():\n "Two\\\n lines."\n if a:\n  for b in c:\n   pass\n elif d:\n  pass\n'
     function = functions(ast.parse(code))[0]
     assert length(function) == 6

@@ -1,4 +1,4 @@
-"""The same words everywhere, and none of the words that mean two things."""
+"""The same words everywhere, and no ambiguous ones."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from tightrope.cli.flags import PEER_NAMES
 
 # `done` hides whether an episode terminated or was truncated: the most expensive confusion in this field.
 NEVER = {"done", "dones", "is_done", "all_done"}
-# words of the peers that also have an everyday meaning and may name something else
+# peers' words that also have an everyday meaning and may name something else
 EVERYDAY = {"epochs", "horizon", "epsilon", "discount", "cuda", "lambda", "normalize", "gae"}
 EVERYDAY |= {"batch_size", "whiten_rewards"}  # language: responses an iteration; rewards over their deviation
 UNFINISHED = re.compile("|".join(["TO" + "DO", "FIX" + "ME", "XX" + "X", r"\bHA" + r"CK\b"]))
 
 
 def identifiers(module: ast.Module) -> Iterator[tuple[int, str]]:
-    """Every name that the code gives to something: variables, attributes, arguments, functions, keywords."""
+    """Every name that the code assigns: variables, attributes, arguments, functions, keywords."""
     for node in ast.walk(module):
         line = getattr(node, "lineno", 0)
         if isinstance(node, ast.Name):
@@ -44,7 +44,7 @@ def test_done_is_no_identifier():
 
 
 def test_no_setting_has_a_second_name():
-    """What stable-baselines3, CleanRL or TRL call a setting is no identifier in the package."""
+    """The names of stable-baselines3, CleanRL and TRL for our settings are not identifiers in the package."""
     banned = set(PEER_NAMES) - EVERYDAY
     assert {"n_steps", "clip_range", "ent_coef", "vf_coef", "cliprange", "kl_coef"} <= banned
     found = [
@@ -57,7 +57,7 @@ def test_no_setting_has_a_second_name():
 
 
 def test_every_peer_name_leads_to_a_setting():
-    """The table of the peers' names points at settings that exist."""
+    """The table of the peers' names points to existing settings."""
     from tightrope.cli.flags import settings_fields
     from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 

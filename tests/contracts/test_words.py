@@ -1,4 +1,4 @@
-"""The repository speaks of itself: nothing in it names a machine that it was made on, or how it was made."""
+"""Nothing in the repository names the machine it was made on, or how it was made."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 
 from source_tree import ROOT, files, name_of
 
-# put together here, so that this file does not find itself
+# joined from parts, so that this file does not match itself
 FOREIGN = [
     "/" + r"work/\w",
     "/" + r"tmp/v\b",
@@ -19,12 +19,12 @@ FOREIGN = [
     r"\b(?:chat" + "gpt|cla" + r"ude|copi" + r"lot)\b",
     r"\bas an " + r"ai\b|\blanguage model " + "wrote",
 ]
-OLD_RUNS = ROOT / "tests" / "old_runs"  # run folders as they were written, which tests read and go on with
+OLD_RUNS = ROOT / "tests" / "old_runs"  # run folders as they were written, which tests read and resume
 TEXT = {".py", ".md", ".toml", ".txt", ".cfg", ".ini", ".yml", ".yaml", ".json", ".svg", ".sh", ""}
 
 
 def foreign(text: str) -> list[str]:
-    """What in a text does not belong here."""
+    """The parts of a text that do not belong here."""
     return [match.group(0) for word in FOREIGN for match in re.finditer(word, text, re.IGNORECASE)]
 
 
@@ -43,9 +43,9 @@ def test_the_check_can_fail():
 
 
 def test_only_text_and_pictures_are_kept():
-    """No archives, weights or notebooks: what a diff cannot show does not belong into the repository.
+    """No archives, weights or notebooks: files that a diff cannot show do not belong in the repository.
 
-    Old runs are the exception: small ones, that nobody edits.
+    Old runs are the exception: they are small, and nobody edits them.
     """
     pictures = {".png", ".gif", ".svg", ".jpg", ".webp"}
     known = TEXT | pictures | {".typed"}

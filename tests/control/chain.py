@@ -1,4 +1,4 @@
-"""A tiny deterministic task for tests of the environment side: the observation says (row, episode, step).
+"""A tiny deterministic task for tests of the environment side: the observation is (row, episode, step).
 
 Episode k of row r follows ``SCRIPT[(k + r) % len(SCRIPT)]``: its length and how it ends. Nothing is random;
 the row is taken from the seed, so that every way to vectorise the task must deliver the same transitions.
@@ -125,7 +125,7 @@ class ChainVector(gym.vector.VectorEnv):
         for i, env in enumerate(self.envs):
             if self.mode == AutoresetMode.NEXT_STEP and self.ended[i]:
                 self.observations[i], _ = env.reset()
-                rewards[i] = 77.0  # whatever stands in a phantom row must not be used
+                rewards[i] = 77.0  # the content of a phantom row must not be used
                 continue
             self.observations[i], rewards[i], terminated[i], truncated[i], _ = env.step(actions[i])
             finals[i] = self.observations[i]
@@ -152,16 +152,16 @@ def register() -> None:
 
 
 class NextStepChain(ChainVector):
-    """A vector version that takes no ``autoreset_mode``, as CartPole's."""
+    """A vector version without ``autoreset_mode``, like CartPole's."""
 
     def __init__(self, num_envs: int = 2) -> None:
         super().__init__(num_envs)
 
 
 def action_for(flat: np.ndarray) -> np.ndarray:
-    """The scripted action of every row, [N, 1] float32 counted from 0: a function of (episode, step) alone.
+    """The scripted action of every row, [N, 1] float32 from 0: depends only on (episode, step).
 
-    Never the one that a masked chain forbids.
+    It is never the one that a masked chain forbids.
     """
     return ((flat[:, -2:].sum(axis=1, keepdims=True) + 1 + flat[:, -3:-2] % 2) % 3).astype(np.float32)
 
@@ -193,7 +193,7 @@ def transitions(environments: Any, count: int, seed: int = BASE_SEED) -> list[li
 
 
 def expected_transitions(num_envs: int, count: int) -> list[list[tuple[Any, ...]]]:
-    """The same, written down from the script without any environment."""
+    """The same, computed from the script without an environment."""
     rows = []
     for row in range(num_envs):
         found: list[tuple[Any, ...]] = []

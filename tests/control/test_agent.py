@@ -1,4 +1,4 @@
-"""The Python face: learn, iterate, predict, value, save, load, warm start."""
+"""The Python interface: learn, iterate, predict, value, save, load, warm start."""
 
 import gymnasium as gym
 import numpy as np
@@ -47,7 +47,7 @@ def test_iterate_reports_every_update():
     assert any(report.episodes for report in reports)
 
 
-def test_learn_goes_on_and_schedules_run_over_the_new_budget():
+def test_learn_continues_and_schedules_run_over_the_new_budget():
     agent = make().learn(512)
     rates = [r.metrics["train/learning_rate"] for r in agent.iterate(512)]
     assert rates[0] == pytest.approx(agent.settings.update.learning_rate)
@@ -111,7 +111,7 @@ def test_save_load_keeps_actions_values_and_learning(kind, tmp_path):
     assert not torch.equal(parameters(agent), parameters(twin))
 
 
-def test_a_saved_agent_of_one_engine_goes_on_with_the_other(tmp_path):
+def test_a_saved_agent_of_one_engine_continues_with_the_other(tmp_path):
     make(engine="fused").learn(256).save(tmp_path / "a")
     agent = tightrope.load(tmp_path / "a")
     assert agent.engine.name == "fused"
@@ -119,7 +119,7 @@ def test_a_saved_agent_of_one_engine_goes_on_with_the_other(tmp_path):
 
 
 class Renamed(gym.ObservationWrapper):
-    """CartPole under another name with other numbers, for a warm start."""
+    """CartPole under another name with other parameters, for a warm start."""
 
     def observation(self, observation):
         return observation * 1.0
@@ -164,7 +164,7 @@ def test_own_module_trains_on_torch_saves_and_loads(tmp_path):
     assert torch.equal(parameters(agent), parameters(twin))
 
 
-def test_own_module_with_wrong_outputs_is_told_what_to_return():
+def test_the_error_for_wrong_module_outputs_names_the_right_ones():
     class Wrong(Own):
         def forward(self, observation):
             return self.pi(torch.tanh(self.body(observation)))
@@ -173,7 +173,7 @@ def test_own_module_with_wrong_outputs_is_told_what_to_return():
         make(policy=Wrong).learn(128)
 
 
-def test_forced_engine_says_what_it_does_not_cover():
+def test_forced_engine_names_what_it_does_not_cover():
     with pytest.raises(ValueError, match="dual_clip"):
         make(engine="fused", dual_clip=3.0)
     assert make(dual_clip=3.0).engine.name == "torch"
@@ -217,7 +217,7 @@ def test_images_through_the_cnn():
 
 
 class Nested(gym.Env):
-    """Every kind of observation at once; the Discrete leaf tells the answer."""
+    """Every kind of observation at once; the Discrete leaf is the answer."""
 
     observation_space = spaces.Dict(
         {

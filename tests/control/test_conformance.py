@@ -1,4 +1,4 @@
-"""The advantages of an episode do not depend on who vectorised it or how its end was announced: bit for bit.
+"""The advantages of an episode are bit-identical for every vector type and every way to signal its end.
 
 The task is the scripted chain (tests/control/chain.py): known lengths, terminations and time limits. The
 policy is a function of (episode, step); the critic is exact arithmetic per row. Every episode that lies
@@ -102,7 +102,7 @@ def whole_episodes(found):
 
 
 def expected_advantages(row, episode, steps):
-    """GAE by its definition, backwards in float32, from the script alone."""
+    """GAE by its definition, backwards in float32, only from the script."""
     numbers = [torch.tensor([[row, episode, k]], dtype=torch.float32) for k in range(len(steps) + 1)]
     values = torch.stack([value(x)[0] for x in numbers])
     trace, result = torch.zeros(()), []
@@ -130,7 +130,7 @@ def test_advantages_are_bit_equal_in_every_mode_and_vector_type(way, reference):
         crossing = [a for a, b in zip(steps, reference[row, episode], strict=True) if a[:3] != b[:3]]
         assert not crossing
         expected = expected_advantages(row, episode, steps)
-        # an episode that a rollout's end cuts in two is bootstrapped there: those differ by design
+        # episodes cut by the end of a rollout are bootstrapped there: they differ by design
         for seen in (steps, reference[row, episode]):
             got = [x[3] for x in seen]
             if got != expected:

@@ -1,4 +1,4 @@
-"""Densities are densities, and what is sampled has the density that is claimed."""
+"""Densities are valid, and samples follow the stated density."""
 
 import math
 
@@ -63,7 +63,7 @@ def test_gsde_noise_has_the_deviation_that_its_density_claims():
     torch.testing.assert_close(logp, expected.detach(), rtol=1e-3, atol=1e-3)
 
 
-def test_gsde_holds_its_noise_and_predict_leaves_it_alone():
+def test_gsde_holds_its_noise_and_predict_does_not_change_it():
     policy, rng = make_policy(std="gsde"), np.random.default_rng(0)
     inputs = {"flat": np.random.default_rng(1).random((4, 3), np.float32)}
     policy.hold_exploration(4, rng)
@@ -112,7 +112,7 @@ def test_frequencies_follow_the_probabilities():
 
 
 def test_entropies_are_those_of_the_maths_to_the_bit():
-    """Of every kind of component, with masked choices, under a deviation for all rows and one for each."""
+    """Every kind of component, with masked choices, and a shared or a per-row deviation."""
     space = spaces.Tuple((spaces.Discrete(5), spaces.MultiBinary(3), spaces.Box(-1, 1, (4,), np.float32)))
     layout, generator = action_layout(space), torch.Generator().manual_seed(0)
     parameters = torch.randn(6, 12, generator=generator)

@@ -1,4 +1,4 @@
-"""What an engine leaves behind, and how another one takes over."""
+"""The end of an engine, and the switch to another one."""
 
 import pytest
 import threadpoolctl
@@ -29,7 +29,7 @@ def test_a_device_that_is_not_there_is_named():
         tightrope.PPO("CartPole-v1", device="nowhere", **SMALL)
 
 
-def test_a_saved_agent_goes_on_with_the_other_engine(tmp_path):
+def test_a_saved_agent_continues_with_the_other_engine(tmp_path):
     agent = tightrope.PPO("CartPole-v1", engine="auto", **SMALL).learn(256)
     assert agent.engine.name == "fused"
     agent.save(tmp_path / "agent")

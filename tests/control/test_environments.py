@@ -41,7 +41,7 @@ def test_async_vector_env_in_every_mode(mode):
 
 
 @pytest.mark.parametrize("mode", [*MODES, "NextStep", "SAME_STEP", "disabled"])
-def test_a_vector_environment_of_ones_own_in_every_mode(mode):
+def test_a_custom_vector_environment_in_every_mode(mode):
     vector = chain.ChainVector(5, mode)
     vector.mode = autoreset_mode(vector)
     assert chain.transitions(make_environments(vector, 5), COUNT) == chain.expected_transitions(5, COUNT)
@@ -53,7 +53,7 @@ def test_a_vector_environment_of_ones_own_in_every_mode(mode):
         ("tightrope_tests/Chain-v0", "auto", False),
         ("tightrope_tests/Chain-v0", "serial", False),
         ("tightrope_tests/Chain-v0", "workers", False),
-        ("tightrope_tests/VectorChain-v0", "vector", False),  # SAME_STEP is asked for where it is offered
+        ("tightrope_tests/VectorChain-v0", "vector", False),  # SAME_STEP is requested if it is offered
         ("tightrope_tests/NextStepChain-v0", "vector", True),
     ],
 )
@@ -143,7 +143,7 @@ def test_a_reset_mask_that_is_ignored_is_noticed():
         actions[::2] = 1
         with pytest.raises(EnvironmentFault, match=r"also changed environments .*Use autoreset"):
             for t in range(200):
-                actions[0] = t % 2  # balances for longer than the others
+                actions[0] = t % 2  # balances longer than the others
                 environments.step(actions)
 
 
@@ -241,7 +241,7 @@ def test_a_forced_backend_that_the_task_lacks():
         make_environments("CartPole-v1", 0)
 
 
-def test_envpool_that_is_missing_says_what_to_install(monkeypatch):
+def test_the_error_for_missing_envpool_names_the_package(monkeypatch):
     real = builtins.__import__
 
     def without(name, *rest, **keywords):

@@ -1,4 +1,4 @@
-"""Normalisers: which rows they see, when they move and restart, and that bootstraps go through them."""
+"""Normalisers: the rows they see, their updates and restarts, and normalised bootstraps."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_observations_by_hand_and_discrete_columns_stay():
 
 
 class Sum(nn.Module):
-    """V = the sum of what it sees: bootstraps then show whether they were normalised."""
+    """V = the sum of the inputs, so that bootstraps show whether they were normalised."""
 
     def __init__(self):
         super().__init__()

@@ -1,4 +1,4 @@
-"""A run that is killed at any moment and gone on with ends with the bits of one that was not."""
+"""A run that is killed at any moment and resumed ends bit for bit like an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ SMALL = {
 
 
 class Killed(BaseException):
-    """What ends a run at once; no code of the library may catch and mend it."""
+    """Ends a run at once; no code of the library may catch it and recover."""
 
 
 class Walk(gym.Env):
-    """A noisy walk that forgets nothing at a reset: only its own state can bring a run back."""
+    """A noisy walk that keeps its memory at a reset: only its saved state can restore a run."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = gym.spaces.Discrete(2)
@@ -100,7 +100,7 @@ def settings_for(env: Any, **values: Any) -> Any:
 
 
 def killed(settings: Any, run: Path, patch: Any, place: Any, name: str, call: int, **more: Any) -> None:
-    """Train, and die in the ``call``-th call of ``place.name``, before it does anything."""
+    """Train, and die at the start of the ``call``-th call of ``place.name``."""
     real, count = getattr(place, name), 0
 
     def dying(*arguments: Any, **keywords: Any) -> Any:
@@ -134,7 +134,7 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_five_hops_end_where_none_does(tmp_path, monkeypatch, kind):
-    """Killed in an update drawn by a seed, five times: before the first checkpoint too, and on the grid."""
+    """Killed five times in a random update, including before the first checkpoint and on the grid."""
     env, values = KINDS[kind]
     settings = settings_for(env, **values)
     train.train(settings, run_dir=tmp_path / "whole")
@@ -198,17 +198,17 @@ def test_points_of_a_grid():
 
 
 @pytest.mark.parametrize("source", ["CartPole-v1", walk])
-def test_environments_begin_anew_on_the_grid_alone_unless_they_give_their_state(tmp_path, source):
-    """With or without files, signals and clocks: Python's learn resets where a run does."""
+def test_environments_are_reset_only_on_the_grid_unless_they_save_their_state(tmp_path, source):
+    """Without files, signals or clocks: learn in Python resets at the same steps as a run."""
     seen: list[int] = []
     agent = tightrope.PPO(source, notify=lambda text: None, **{**SMALL, "engine": "torch"})
     real = agent.environments.reset
     agent.environments.reset = lambda seed: seen.append(seed) or real(seed)  # type: ignore[method-assign]
     points = [report.step for report in agent.iterate() if report.on_grid]
     agent.close()
-    assert points == [200, 400, 600]  # 180, 360 and 540, at the end of the update under way
+    assert points == [200, 400, 600]  # 180, 360 and 540, at the end of the current update
     assert seen[0] == SMALL["seed"]
-    assert len(seen) == len(set(seen)) == (1 if source is walk else 3)  # behind the end nothing begins
+    assert len(seen) == len(set(seen)) == (1 if source is walk else 3)  # nothing begins after the end
 
 
 def test_cut_episodes_are_not_counted_and_their_rewards_are_forgotten():
@@ -286,7 +286,7 @@ def test_what_a_state_may_hold():
             states.decode(forged)
 
 
-def test_a_wrapper_with_a_state_of_its_own_hides_the_one_inside():
+def test_a_wrapper_with_its_own_state_hides_the_inner_one():
     assert states.gives_state(gym.wrappers.OrderEnforcing(walk()))
     assert not states.gives_state(gym.wrappers.DelayObservation(walk(), 2))
     assert not states.gives_state(gym.make("CartPole-v1"))
@@ -330,7 +330,7 @@ def test_a_state_of_other_shapes_is_refused(tmp_path):
         train.resume(run, env=walk)
 
 
-def test_resume_says_what_it_cannot_promise(tmp_path, monkeypatch):
+def test_resume_prints_what_it_cannot_promise(tmp_path, monkeypatch):
     settings = settings_for("CartPole-v1", engine="torch")
     killed(settings, tmp_path / "run", monkeypatch, Agent, "_one_update", 4)
     said: list[str] = []

@@ -70,7 +70,7 @@ def test_flat_agrees_with_gymnasiums_flatten(space):
     np.testing.assert_allclose(flat, gym.spaces.flatten(space, value).astype(np.float32))
 
 
-def test_nested_columns_follow_the_flatten_order_and_say_what_may_be_normalised():
+def test_nested_columns_follow_the_flatten_order_and_mark_what_may_be_normalised():
     layout = observation_layout(NESTED)
     assert layout.size == 5 + 3 + 4 + 2 and layout.image_shapes == ((8, 9, 3),)
     assert layout.continuous.tolist() == [False] * 8 + [True] * 4 + [False] * 2
@@ -150,7 +150,7 @@ def test_unsupported_spaces_are_named(space):
         (spaces.Box(-1, 1, (1,)), np.array(["a"]), "not an array of numbers"),
     ],
 )
-def test_an_observation_outside_its_space_says_what_came(space, value, message):
+def test_the_error_for_an_observation_outside_its_space_shows_it(space, value, message):
     with pytest.raises(ValueError, match=message):
         observation_layout(space).encode(value, batched=False)
 

@@ -1,4 +1,4 @@
-"""Ids, instances and factories: what is made of them, and which error a mistake gets."""
+"""Ids, instances and factories: the environments made from them, and the errors for mistakes."""
 
 from __future__ import annotations
 
@@ -180,7 +180,9 @@ def test_atari_uses_its_vector_version_with_same_step():
         assert environments.observation_layout.image_shapes == ((4, 84, 84),)
         inputs, mask = environments.reset(0)
         assert inputs["image0"].shape == (2, 4, 84, 84) and mask is None
-        for _ in range(1200):  # nobody moves: the first point after about 60 steps, the game after about 1000
+        for _ in range(
+            1200
+        ):  # the player never moves: the first point after about 60 steps, the game after about 1000
             step = environments.step(np.zeros((2, 1), np.float32))
             assert step.phantom is None
             if step.terminated.any():
@@ -216,7 +218,7 @@ def test_atari_truncations_bring_their_final_observation():
 @pytest.mark.parametrize(
     "env_id", ["LunarLander-v3", "HalfCheetah-v5", "CartPole-v1", "MountainCarContinuous-v0"]
 )
-def test_standard_tasks_say_nothing_on_stderr(env_id, tmp_path):
+def test_standard_tasks_print_nothing_on_stderr(env_id, tmp_path):
     if env_id != "CartPole-v1":
         pytest.importorskip({"L": "Box2D", "H": "mujoco"}.get(env_id[0], "gymnasium"))
     code = f"""

@@ -1,4 +1,4 @@
-"""Copies in this process and in workers: the same transitions, clear faults, no process left behind."""
+"""Copies in this process and in workers: the same transitions, clear faults, no leftover process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_any_number_of_workers_delivers_the_scripted_transitions(num_workers):
         assert (environments.backend, environments.num_workers) == ("workers", num_workers)
         found = chain.transitions(environments, COUNT)
         assert found == chain.expected_transitions(5, COUNT)
-        assert chain.transitions(environments, COUNT) == found  # a second reset begins anew
+        assert chain.transitions(environments, COUNT) == found  # a second reset starts over
 
 
 def test_workers_step_random_environments_to_the_same_bits():
@@ -42,7 +42,7 @@ def test_workers_step_random_environments_to_the_same_bits():
             traces.append(np.stack(trace))
     np.testing.assert_array_equal(traces[0], traces[1])
     np.testing.assert_array_equal(traces[0], traces[2])
-    assert not np.array_equal(traces[0][:, 0], traces[0][:, 1])  # each copy has a seed of its own
+    assert not np.array_equal(traces[0][:, 0], traces[0][:, 1])  # each copy has its own seed
 
 
 def test_copy_i_is_seeded_with_seed_plus_i():
@@ -197,7 +197,7 @@ def test_copies_that_fail_to_build_in_a_worker_close_the_others():
 
 
 def alive(pid: int) -> bool:
-    """True for a process that still runs (a zombie does not)."""
+    """Whether a process still runs (a zombie does not)."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:

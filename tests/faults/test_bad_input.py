@@ -1,4 +1,4 @@
-"""Bad input is named: what was seen, what was expected, what to do; exit code 2; weights untouched."""
+"""Errors for bad input state the value, the expectation and the remedy; exit code 2; weights unchanged."""
 
 import json
 
@@ -17,7 +17,7 @@ SMALL = dict(num_envs=2, num_steps=16, minibatch_size=16, num_epochs=1, seed=0)
 
 
 class Faulty(gym.Env):
-    """CartPole-like shapes; goes wrong at a given step."""
+    """CartPole-like shapes; fails at a given step."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = spaces.Discrete(2)
@@ -92,7 +92,7 @@ def test_an_environment_that_breaks_is_named(backend, fault, words):
     agent.close()
 
 
-def test_an_instance_that_cannot_be_replicated_is_told_what_to_pass():
+def test_the_error_for_an_instance_that_cannot_be_copied_names_the_alternative():
     env = Faulty("none")
     env.lock = __import__("threading").Lock()
     with pytest.raises(ValueError, match=r"num_envs=1|factory"):
@@ -126,7 +126,7 @@ def test_unsupported_spaces_are_named(space):
         ),
     ],
 )
-def test_a_users_mistake_exits_with_2_and_says_what_to_do(arguments, words, capsys, tmp_path):
+def test_a_users_mistake_exits_with_2_and_advice(arguments, words, capsys, tmp_path):
     try:
         code = main(["train", *arguments, "--run-dir", str(tmp_path / "run"), "--total-steps", "100"])
     except SystemExit as error:
@@ -156,7 +156,7 @@ def test_risky_settings_are_trained_as_asked_with_a_warning(flags, words, capsys
 
 
 class Late(Faulty):
-    """Goes wrong only in the copy that was seeded with 3."""
+    """Fails only in the copy that was seeded with 3."""
 
     def reset(self, *, seed=None, options=None):
         if seed is not None:
@@ -172,7 +172,7 @@ class Late(Faulty):
     ("at", "last", "what"), [(20, True, "final observation"), (16, False, "observation")]
 )
 def test_the_right_environment_and_step_are_named(at, last, what):
-    """Also for a true final observation, and for the one after a rollout's last column."""
+    """Also for a true final observation, and for the observation after a rollout's last column."""
     agent = tightrope.PPO(
         lambda: Late("nan", at=at, last=last),
         vector_backend="serial",
@@ -210,7 +210,7 @@ def test_save_never_replaces_what_is_no_checkpoint(tmp_path):
 
 
 class MethodMask(Faulty):
-    """Forbids action 0 by a method alone."""
+    """Forbids action 0 only by a method."""
 
     def __init__(self):
         super().__init__("none")

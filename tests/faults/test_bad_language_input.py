@@ -1,4 +1,4 @@
-"""Prompts and rewards that cannot be: named with exit code 2, or masked and counted; never a wrong number."""
+"""Invalid prompts and rewards: named with exit code 2, or masked and counted; never a wrong number."""
 
 import json
 import time
@@ -92,16 +92,16 @@ GOOD = [{"prompt": text, "answer": text} for text in ("ab", "cd", "efg")]
     ],
     ids=lambda value: str(value)[:30] if isinstance(value, str) else "",
 )
-def test_a_mistake_exits_with_2_and_says_what_to_do(place, tmp_path, capsys, rows, reward, more, words):
+def test_a_mistake_exits_with_2_and_advice(place, tmp_path, capsys, rows, reward, more, words):
     begin = time.monotonic()
     assert run(place, tmp_path, rows, reward, *more) == 2
     error = capsys.readouterr().err
     assert all(word in error for word in words) and "Traceback" not in error, error
-    assert "on_error" not in error  # no option of the command line
+    assert "on_error" not in error  # not an option of the command line
     assert time.monotonic() - begin < 20
 
 
-def test_responses_without_a_score_are_masked_counted_and_told_once(place, tmp_path, capsys):
+def test_responses_without_a_score_are_masked_counted_and_reported_once(place, tmp_path, capsys):
     assert run(place, tmp_path, GOOD, "some") == 0
     error = capsys.readouterr().err
     assert error.count("expected a finite number or None") == 1 and error.count("all returned None") == 1
@@ -110,7 +110,7 @@ def test_responses_without_a_score_are_masked_counted_and_told_once(place, tmp_p
     assert {row["objective/scores"] for row in rows} == {1.5} == {row["scores/some"] for row in rows}
 
 
-def test_a_batch_that_came_too_late_is_left_out_and_the_run_goes_on(place, tmp_path, capsys):
+def test_a_late_batch_is_left_out_and_the_run_continues(place, tmp_path, capsys):
     assert run(place, tmp_path, GOOD, "slow", "--reward-timeout", "1") == 0
     assert "was not back after 1 s" in capsys.readouterr().err
     rows = Run.open(tmp_path / "run").read_metrics()
@@ -127,7 +127,7 @@ def test_prompts_over_their_length_lose_their_beginning_and_are_counted(place, t
 
 
 class Rows:
-    """What datasets.Dataset offers: no list, no mapping; it yields dicts and knows its columns."""
+    """The interface of datasets.Dataset: not a list or mapping; yields dicts and has column names."""
 
     def __init__(self, rows):
         self.rows, self.column_names = rows, list(rows[0])

@@ -1,4 +1,4 @@
-"""A NaN or an infinity, wherever it comes up, is named before the step: the weights stay as they are."""
+"""A NaN or an infinity from any source is named before the step, and the weights stay unchanged."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def agent(request):
 
 
 def refused(agent, words):
-    """Train, expect the refusal, and that no weight and no moment moved."""
+    """Train, expect the error, and check that no weight and no moment moved."""
     before = weights(agent.policy)
     with pytest.raises(NonFiniteError, match=words):
         agent.learn(64)
@@ -61,7 +61,7 @@ def test_what_is_computed_from_a_rollout(agent, site, bad, monkeypatch):
         return batch
 
     monkeypatch.setattr(module, "to_batch", poisoned)
-    if site == "value":  # old values are part of the loss with value_clip alone
+    if site == "value":  # only with value_clip are old values part of the loss
         agent.settings = agent.settings.with_values(value_clip=0.2)
     words = {"value": "The old value", "advantage": "The advantage", "loss": "loss|gradient"}[site]
     refused(agent, words)
@@ -89,7 +89,7 @@ def test_logits_that_overflow(agent):
 
 
 def test_one_gradient_is_named():
-    """Torch alone computes gradients that somebody else may touch."""
+    """Only on torch can other code change the gradients."""
     agent = agent_on("torch")
 
     def poison(gradient):
@@ -145,7 +145,7 @@ def line_batch():
 )
 def test_each_site_is_named_in_each_rule(rule, site, words):
     if rule != "ppo" and site == "old_logp":
-        return  # it is no part of their loss
+        return  # it is not part of their loss
     module, settings = RULES[rule]
     model, batch = Line(), line_batch()
     optimiser = make_optimiser(model.parameters(), [], settings)

@@ -1,4 +1,4 @@
-"""A fault of an environment is named in full and bounded in time, or survived by making it anew."""
+"""A fault of an environment is fully named and bounded in time, or survived by a restart."""
 
 import contextlib
 import json
@@ -34,7 +34,7 @@ AT = 5
 
 
 class Frail(gym.Env):
-    """The observation tells the seed and the step; copy ``row`` (seeded with 5 + row) fails at step AT."""
+    """The observation is the seed and the step; copy ``row`` (seeded with 5 + row) fails at step AT."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = spaces.Discrete(2)
@@ -60,7 +60,7 @@ class Frail(gym.Env):
             if self.how == "leave":
                 raise SystemExit(0)
             while self.how == "stubborn":
-                with contextlib.suppress(Exception):  # as a simulator's client that connects again
+                with contextlib.suppress(Exception):  # like a simulator's client that reconnects
                     time.sleep(600)
             if self.how == "exit":
                 os._exit(7)
@@ -81,7 +81,7 @@ class Frail(gym.Env):
 
 @pytest.fixture
 def agent_on():
-    """Makes agents, and closes them whatever happens."""
+    """Makes agents and always closes them."""
     made = []
 
     def make(*arguments, **more):
@@ -109,7 +109,7 @@ def weights(agent):
 
 
 def children():
-    """Processes that this one started and that are still there, zombies included."""
+    """Child processes that still exist, including zombies."""
     return Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
 
 
@@ -181,7 +181,7 @@ def test_the_action_named_is_the_one_that_led_there(agent_on):
 
 
 @pytest.mark.parametrize("how", ["raise", "exit", "kill", "hang", "shape", "tuple", "nan", "reward", "reset"])
-def test_with_restart_a_run_goes_on_and_counts_it(how, agent_on):
+def test_with_restart_a_run_continues_and_counts_it(how, agent_on):
     agent = agent_on(how, on_env_fault="restart", env_timeout=0.5)
     counts = [progress.metrics["rollout/environment_restarts"] for progress in agent.iterate(256)]
     assert counts[0] == 1.0 and sum(counts) == 1.0
@@ -191,11 +191,11 @@ def test_with_restart_a_run_goes_on_and_counts_it(how, agent_on):
 
 @pytest.mark.parametrize("how", ["raise", "hang", "nan", "tuple"])
 def test_the_same_in_this_process_and_to_the_same_bits(how, agent_on):
-    """A fault that leaves the process alive cuts one copy, whoever steps it."""
+    """A fault that leaves the process alive cuts only one copy, on every backend."""
     results = []
     for backend in ("serial", "workers", "serial"):
         if how == "hang" and backend == "workers":
-            continue  # there the whole process is replaced, and its other copy with it
+            continue  # the whole process is replaced, including its other copy
         agent = agent_on(how, backend, on_env_fault="restart", env_timeout=0.5)
         agent.learn(256)
         results.append(weights(agent))
@@ -226,7 +226,7 @@ def test_the_failed_step_does_not_count_and_the_one_before_is_bootstrapped(how, 
     assert not rollout.mask[rows, column].any() and rollout.ended[rows, column].all()
     assert rollout.mask.sum() == 64 - len(rows) == rollout.steps
     assert rollout.mask[others].all() and not rollout.terminated.any()
-    # the episode that was cut is none; the next ones begin anew behind it, with a seed of their own
+    # the cut episode does not count; the next ones start after it, with their own seed
     assert rollout.episodes == [(12.0, 12, False)] * len(others)
     seeds = [restart_seed(SMALL["seed"], 1, row) for row in rows]
     np.testing.assert_array_equal(rollout.inputs["flat"][rows, column + 1, 0], np.float32(seeds))
@@ -272,7 +272,7 @@ def test_pauses_grow_and_stay_bounded():
 
 
 @pytest.mark.parametrize(("policy", "code"), [("raise", 2), ("restart", 2)])
-def test_the_command_ends_with_2_and_says_why(policy, code, capsys, tmp_path):
+def test_the_command_exits_with_2_and_a_reason(policy, code, capsys, tmp_path):
     gym.register("tightrope_tests/Frail-v0", entry_point=lambda: Frail("raise", always=True))
     words = ["--total-steps", "500", "--run-dir", str(tmp_path / "r"), "--max-env-restarts", "2"]
     try:
@@ -306,7 +306,7 @@ def test_restarts_are_in_the_metrics_of_a_run_and_episodes_are_none_of_them(tmp_
 
 
 class Keeper(Frail):
-    """Copy 3 fails when it gives (``how`` "kill get") or takes its state."""
+    """Copy 3 fails when its state is saved (``how`` "kill get") or restored."""
 
     def _keep(self, when):
         how, _, at = self.how.partition(" ")
@@ -355,7 +355,7 @@ def test_a_fault_while_a_state_is_kept_is_named_and_ends_the_run(how, backend, w
 
 
 class Choosy(Keeper):
-    """Cannot be reset with the seed that copy 3 begins with."""
+    """Cannot be reset with the first seed of copy 3."""
 
     def reset(self, *, seed=None, options=None):
         if seed == SMALL["seed"] + 3:
@@ -427,7 +427,7 @@ def test_a_worker_that_hangs_does_not_outlive_its_parent():
 
 
 def alive(pid):
-    """Whether a process is there and no zombie."""
+    """Whether a process exists and is not a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -438,7 +438,7 @@ def alive(pid):
 
 
 class FrailVector(gym.vector.SyncVectorEnv):
-    """Two Frails in one; only the first one ever made fails."""
+    """Two Frails in one; only the very first one fails."""
 
     made = 0
 
@@ -452,7 +452,7 @@ class FrailVector(gym.vector.SyncVectorEnv):
     ("how", "words"),
     [("raise", "raised RuntimeError: the simulator broke"), ("hang", "not back after 0.5 s")],
 )
-def test_a_vector_environment_of_the_users_own_is_named_and_cannot_be_made_anew(how, words):
+def test_a_users_vector_environment_is_named_and_cannot_be_restarted(how, words):
     FrailVector.made = 0
     vector = FrailVector(how=how)
     agent = tightrope.PPO(vector, **{**SMALL, "num_envs": 2}, on_env_fault="restart", env_timeout=0.5)
@@ -465,7 +465,7 @@ def test_a_vector_environment_of_the_users_own_is_named_and_cannot_be_made_anew(
     vector.close()
 
 
-def test_a_vector_version_of_an_id_is_made_anew_with_all_its_copies():
+def test_a_vector_version_of_an_id_is_restarted_with_all_its_copies():
     FrailVector.made = 0
     kinds = {"entry_point": lambda: Frail("no"), "vector_entry_point": FrailVector}
     gym.register("tightrope_tests/FrailVector-v0", **kinds)

@@ -1,5 +1,5 @@
-"""A disk that refuses while a run trains: the run goes on without a checkpoint in the middle, and never
-without its last one or its records. Both stories, and the command line.
+"""A disk error during training: a run continues without a checkpoint in the middle, but never without its
+last one or its records. Control, language, and the command line.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def steps(folder: Path) -> list[int]:
 
 
 @EVERY
-def test_a_checkpoint_that_fails_in_the_middle_is_said_and_training_goes_on(
+def test_a_failed_checkpoint_in_the_middle_is_reported_and_training_continues(
     tmp_path: Path, model: str, monkeypatch: pytest.MonkeyPatch, story: str
 ) -> None:
     run, _ = STORIES[story]
@@ -97,7 +97,7 @@ def test_a_checkpoint_that_fails_in_the_middle_is_said_and_training_goes_on(
     bare = [
         [{k: v for k, v in row.items() if k[:4] not in ("seco", "time")} for row in each] for each in rows
     ]
-    assert bare[0] == bare[1]  # a checkpoint that is not written changes no bit
+    assert bare[0] == bare[1]  # a missing checkpoint changes no bit
 
 
 @EVERY
@@ -116,7 +116,7 @@ def test_the_last_checkpoint_must_be_written_and_the_run_can_go_on(
     assert seen == sorted(set(seen)) and steps(tmp_path / "run")[-1] == seen[-1]
 
 
-def test_the_command_line_says_it_in_one_message(
+def test_the_command_line_prints_one_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [

@@ -126,7 +126,7 @@ def test_a_bad_number_is_named_before_the_step(folder, site, words, bad, monkeyp
 # ------------------------------------------------------------------------------------------------ memory
 
 
-def test_a_minibatch_that_does_not_fit_is_halved_told_and_remembered(folder, monkeypatch):
+def test_a_minibatch_that_does_not_fit_is_halved_reported_and_remembered(folder, monkeypatch):
     from tightrope.language.alignment import iteration as module
 
     results = []
@@ -164,7 +164,7 @@ def test_sampling_that_does_not_fit_ends_with_advice(folder, monkeypatch):
         next(trainer(folder).iterate())
 
 
-def test_a_rollout_whose_gradients_do_not_fit_goes_on_without_keeping_them(folder, monkeypatch):
+def test_a_rollout_whose_gradients_do_not_fit_continues_without_keeping_them(folder, monkeypatch):
     from tightrope.language.alignment import experience as collect
     from tightrope.language.policy.policy_model import PolicyModel
 
@@ -189,7 +189,7 @@ def test_a_rollout_whose_gradients_do_not_fit_goes_on_without_keeping_them(folde
 
 
 def test_a_pass_that_failed_for_memory_is_held_by_nothing(folder, monkeypatch):
-    """Its graph, that of the rollout's pass, is gone before the minibatch is done again in halves."""
+    """The graph of the rollout's pass is freed before the minibatch is repeated in halves."""
     from tightrope.language.alignment import iteration as module
 
     made, graphs, alive = trainer(folder, total_episodes=8, kl="exact-split"), [], []
@@ -275,7 +275,7 @@ def test_tensors_arrays_and_tuples_are_scores(values):
 
 
 @pytest.mark.parametrize("critic", ["head", "none"])
-def test_batches_without_one_score_teach_nothing_and_the_run_goes_on(folder, critic):
+def test_batches_without_a_score_teach_nothing_and_the_run_continues(folder, critic):
     calls, scored = [0], [4.0] * 8
 
     def late(completions, **_):

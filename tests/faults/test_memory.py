@@ -1,4 +1,4 @@
-"""When memory runs out the micro-batches are halved and the step is the same, or the advice is clear."""
+"""When memory runs out, the micro-batches are halved and the step is the same, or the advice is clear."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ ERRORS = [
 
 
 def step(rule, fits, error=ERRORS[0], micro_batch_size=None, late=False, noise=False, look=None, **more):
-    """One update in which passes over more than ``fits`` rows fail; the parameters and the metrics."""
+    """The parameters and metrics of one update in which passes over more than ``fits`` rows fail."""
     module, settings = RULES[rule]
     settings = dataclasses.replace(settings, micro_batch_size=micro_batch_size)
     model, batch = Line().double(), line_batch().map(lambda x: x.double() if x.is_floating_point() else x)
@@ -50,12 +50,12 @@ def test_the_step_is_the_same_in_halves(rule, error):
     assert passes == [6, 3, 2, 2, 2]
     assert metrics["train/micro_batch_size"] == 2 and metrics["train/memory_halvings"] == 2
     assert "train/memory_halvings" not in plain
-    for name, value in plain.items():  # and so are the sums, none counted twice
+    for name, value in plain.items():  # the sums too, none counted twice
         assert metrics[name] == pytest.approx(value, rel=1e-6, abs=1e-7), name
 
 
 def test_what_a_failed_pass_added_before_it_failed_is_taken_back():
-    """The second part of two fails, after the first has left its gradient and its sums."""
+    """The second part of two fails, after the first has added its gradient and its sums."""
     whole, plain, _ = step("ppo", fits=100)
     halved, metrics, passes = step("ppo", fits=2, micro_batch_size=3, late=True)
     assert passes == [3, 3, 2, 2, 2]
@@ -66,7 +66,7 @@ def test_what_a_failed_pass_added_before_it_failed_is_taken_back():
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("late", [False, True])
 def test_a_pass_that_is_repeated_draws_the_same_random_numbers(rule, late):
-    """A policy of one's own may draw some; those of torch begin again where the failed pass began."""
+    """A custom policy may draw random numbers; torch's restart where the failed pass started."""
     ends = []
     for fits in (100, 2):
         torch.manual_seed(7)
@@ -81,7 +81,7 @@ def test_a_pass_that_is_repeated_draws_the_same_random_numbers(rule, late):
 
 @pytest.mark.parametrize("rule", RULES)
 def test_what_is_drawn_for_a_minibatch_is_drawn_once(rule):
-    """Inputs that `draw` adds are those of the rows they were drawn for, in every part and repetition."""
+    """Inputs added by `draw` stay with their rows, in every part and repetition."""
     drawn = []
 
     def draw(batch):

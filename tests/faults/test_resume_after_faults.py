@@ -1,4 +1,4 @@
-"""Faults that a run recovers from do not cost it its exact resume: what they count lies in the checkpoint."""
+"""A run that recovered from faults still resumes exactly: the checkpoint contains their counts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tightrope.training.events import Event, Updated
 
 
 class Brittle(Walk):
-    """Breaks about once in 40 steps, at places that are a function of the bits."""
+    """Fails about once in 40 steps, at steps that depend on the bits of the run."""
 
     def step(self, action: int) -> Any:
         found = super().step(action)
@@ -32,7 +32,7 @@ class Brittle(Walk):
 
 
 class Sealed(Brittle):
-    """The same without a state to give."""
+    """The same without a state to save."""
 
     get_state = set_state = None  # type: ignore[assignment]
 
@@ -43,7 +43,7 @@ class Sealed(Brittle):
 
 
 @pytest.mark.parametrize(("env", "workers"), [(Brittle, 1), (Brittle, 2), (Sealed, 1)])
-def test_restarts_are_counted_on_and_seeds_of_those_made_anew_go_on(tmp_path, monkeypatch, env, workers):
+def test_the_count_of_restarts_and_their_seeds_continue(tmp_path, monkeypatch, env, workers):
     monkeypatch.setattr(faults, "pause", lambda *_: 0.0)
     settings = settings_for(
         env, on_env_fault="restart", max_env_restarts=500, num_workers=workers, engine="torch"
@@ -74,7 +74,7 @@ def poison_control(patch: Any) -> None:
 
 
 def test_rollbacks_of_a_control_run(tmp_path, monkeypatch):
-    """Killed behind the first one, of which no checkpoint knows yet, and behind one that does."""
+    """Killed after the first one, before any checkpoint records it, and after one that is recorded."""
     poison_control(monkeypatch)
     settings = settings_for("CartPole-v1", engine="torch", max_rollbacks=2)
     train.train(settings, run_dir=tmp_path / "whole")

@@ -1,4 +1,4 @@
-"""Back to the newest checkpoint after a NaN: bounded, counted, on other random numbers, in both stories."""
+"""Rollback to the newest checkpoint after a NaN: bounded, counted, with new random numbers, for all runs."""
 
 import json
 
@@ -19,7 +19,7 @@ CONTROL = {
 
 
 def poison(monkeypatch, times):
-    """An advantage of NaN in the fifth update and the ones in its place after going back."""
+    """An advantage of NaN in the fifth update and in its repetitions after a rollback."""
     from tightrope.control import agent as module
 
     whole, calls, seen = module.to_batch, [0, 0], []
@@ -31,7 +31,7 @@ def poison(monkeypatch, times):
             calls[1] += 1
             seen.append(rollout.actions.copy())
             batch.advantages[0, 0] = torch.nan
-            calls[0] = 4  # the run goes back to the checkpoint of the fourth
+            calls[0] = 4  # the run returns to the checkpoint of the fourth
         return batch
 
     monkeypatch.setattr(module, "to_batch", poisoned)
@@ -39,7 +39,7 @@ def poison(monkeypatch, times):
 
 
 @pytest.mark.parametrize("engine", ["torch", "fused"])
-def test_control_goes_back_goes_on_and_counts(engine, monkeypatch, tmp_path):
+def test_control_rolls_back_continues_and_counts(engine, monkeypatch, tmp_path):
     seen, lines = poison(monkeypatch, 2), []
     settings = TrainSettings().with_values(**CONTROL, engine=engine)
 
@@ -64,14 +64,14 @@ def test_control_ends_when_it_went_back_often_enough(monkeypatch, tmp_path):
         train(settings, run_dir=tmp_path / "run")
 
 
-def test_without_a_checkpoint_it_ends_and_says_so(monkeypatch, tmp_path):
+def test_without_a_checkpoint_it_ends_and_reports_it(monkeypatch, tmp_path):
     poison(monkeypatch, 1)
     settings = TrainSettings().with_values(**{**CONTROL, "checkpoint_every": None}, engine="torch")
     with pytest.raises(NonFiniteError, match="advantage.*There is no checkpoint to go back to"):
         train(settings, run_dir=tmp_path / "run")
 
 
-def test_language_goes_back_goes_on_and_counts(monkeypatch, tmp_path):
+def test_language_rolls_back_continues_and_counts(monkeypatch, tmp_path):
     from tightrope.language.alignment import iteration as module
 
     model, whole, calls, texts = saved(tmp_path / "model"), module.batch_of, [0], []

@@ -1,4 +1,4 @@
-"""The quick half of `make storm`: a few kills of one story, by the same script."""
+"""A quick version of `make storm`: a few kills of one story, by the same script."""
 
 from __future__ import annotations
 

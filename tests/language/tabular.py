@@ -1,4 +1,4 @@
-"""A language so small that every response can be written down, and a policy with a row of logits per prefix.
+"""A language small enough to list every response, and a policy with a row of logits per prefix.
 
 Token 0 is EOS: a response ends with it, or after `length` tokens. Everything is float64.
 """
@@ -26,7 +26,7 @@ class Language:
 
     @staticmethod
     def _is_canonical(row: tuple[int, ...]) -> bool:
-        """Of the rows that differ behind their EOS alone, the one with nothing but EOS there."""
+        """Of the rows that differ only after their EOS, the one with only EOS there."""
         return EOS not in row or not any(row[row.index(EOS) :])
 
     @staticmethod
@@ -61,7 +61,7 @@ class Tabular(nn.Module):
         return rows.gather(-1, tokens[..., None])[..., 0]
 
     def exact(self, tokens: Tensor, reference: "Tabular") -> Tensor:
-        """KL(self || reference) of every state on the way, [B, T]."""
+        """KL(self || reference) of every visited state, [B, T]."""
         states = self.language.states(tokens)
         logp, other = (logits[states].log_softmax(-1) for logits in (self.logits, reference.logits))
         return (logp.exp() * (logp - other)).sum(-1)
@@ -78,7 +78,7 @@ class Tabular(nn.Module):
 
     @torch.no_grad()
     def sample(self, rows: int, generator: torch.Generator) -> Tensor:
-        """Responses [rows, T]; behind an EOS stands EOS."""
+        """Responses [rows, T]; EOS is followed by EOS."""
         tokens = torch.zeros(rows, self.language.length, dtype=torch.int64)
         for t in range(self.language.length):
             probabilities = self.logits[self.language.states(tokens)[:, t]].softmax(-1)

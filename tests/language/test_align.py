@@ -1,4 +1,4 @@
-"""The third stage end to end on a tiny model: it learns, it is saved, it goes on, and mistakes are named."""
+"""The third stage end to end on a tiny model: it learns, saves and resumes, and mistakes are named."""
 
 import asyncio
 import json
@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
 
 
 def letters(prompts, completions, **columns):
-    """How many of the characters are a to m."""
+    """The number of characters from a to m."""
     return [sum(c in "abcdefghijklm" for c in text) / 6 for text in completions]
 
 
@@ -106,7 +106,7 @@ def test_the_aligned_model_opens_elsewhere(folder, tmp_path):
     assert AutoTokenizer.from_pretrained(run.model).chat_template
     bare = AutoModelForCausalLM.from_pretrained(folder)
     a, b = (Trunk(model.eval()).hidden(tokens, real)[real] for model in (plain, bare))
-    assert (a - b).abs().max() > 1e-3  # trained weights, not those it began with
+    assert (a - b).abs().max() > 1e-3  # trained weights, not the initial ones
     names = {path.suffix for path in run.path.rglob("*") if path.is_file()}
     assert not names & {".bin", ".pt", ".pth", ".pkl"}
     peft = pytest.importorskip("peft")
@@ -125,8 +125,8 @@ def vowels(completions, **_):
     return [sum(c in "aeiou" for c in text) / 6 for text in completions]
 
 
-def test_a_run_that_goes_on_ends_where_one_without_a_break_does(folder, tmp_path):
-    """To the last bit: weights, optimiser, random numbers, prompt order, kl_beta, what the gold judge saw."""
+def test_a_resumed_run_ends_like_an_uninterrupted_one(folder, tmp_path):
+    """Bit for bit: weights, optimiser, random numbers, prompt order, kl_beta, the gold judge's samples."""
     values = {**FAST, "checkpoint_every": 0.5, "kl_goal": 1.0, "kl_horizon": 100.0, "evaluate_every": 0.3}
     given = {"prompts": PROMPTS, "reward": letters, "gold": vowels}
     whole = align(model=folder, run_dir=tmp_path / "a", **given, **values)
@@ -236,7 +236,7 @@ def test_a_kl_budget_stops_the_run(folder, tmp_path):
     assert "train/grad_norm" in run.metrics[-2] and "train/grad_norm" not in run.metrics[-1]
 
 
-def test_no_critic_is_said_as_in_python():
+def test_critic_none_is_accepted_as_in_python():
     assert AlignSettings(critic=None, samples_per_prompt=2).critic == "none"
 
 

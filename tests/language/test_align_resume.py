@@ -1,4 +1,4 @@
-"""An alignment run that is killed at any moment and gone on with ends with the bits of one that was not."""
+"""An alignment run that is killed at any moment and resumed ends bit for bit like an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SMALL = {
 
 
 class Killed(BaseException):
-    """What ends a run at once."""
+    """Ends a run at once."""
 
 
 def letters(completions: list[str], **_: Any) -> list[float]:
@@ -136,7 +136,7 @@ def test_a_run_that_its_budget_stopped_stays_stopped(tmp_path, monkeypatch, valu
 
 
 def test_the_command_names_the_judge_again(tmp_path, monkeypatch, values, capsys):
-    """Stopped by SIGTERM: 143, the newest checkpoint, what is repeated, and a command that works."""
+    """Stopped by SIGTERM: 143, the newest checkpoint, the repeated steps, and a working command."""
     judge, prompts, run = tmp_path / "judge.py", tmp_path / "prompts.txt", tmp_path / "run"
     judge.write_text("def score(completions, **_):\n    return [float(len(c)) for c in completions]\n")
     prompts.write_text("\n".join(PROMPTS))
@@ -160,8 +160,8 @@ def test_the_command_names_the_judge_again(tmp_path, monkeypatch, values, capsys
     assert main(["resume", str(run), "--reward", f"{judge}:score", "--quiet"]) == 0
 
 
-def test_a_function_is_asked_for_again_whatever_its_name(tmp_path, values, monkeypatch):
-    """Neither a reward that this package knows nor a folder that lies about is taken for it."""
+def test_a_function_must_be_named_again_whatever_its_name(tmp_path, values, monkeypatch):
+    """It is mistaken neither for a reward of this package nor for a folder of the same name."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rewards").mkdir()
     for name in ("length", "rewards"):
@@ -210,4 +210,4 @@ def test_a_run_that_somebody_writes_is_refused_before_its_settings_are_looked_at
         resume_align(run, **GIVEN)
     with pytest.raises(AssertionError, match="looked at"):
         resume_align(run, **GIVEN)
-    Run.open(run).lock().close()  # what failed has given the lock back
+    Run.open(run).lock().close()  # the failed call has released the lock

@@ -1,6 +1,4 @@
-"""From responses to a batch: values of the right state, scores at the right token, numbers that say what they
-are called.
-"""
+"""From responses to a batch: values of the right state, scores at the right token, correct metrics."""
 
 import dataclasses
 import math
@@ -31,7 +29,7 @@ def folder(tmp_path_factory):
 
 
 def experienced(present, **micro):
-    """Roles that have been trained a little, and what they sampled."""
+    """Slightly trained roles, and their samples."""
     present = dataclasses.replace(present, update=dataclasses.replace(present.update, **micro))
     roles = fresh(present)
     shake(roles)
@@ -69,7 +67,7 @@ def test_a_value_is_the_critics_of_the_text_before_the_token(folder, critic, lay
 
 
 def test_responses_of_different_lengths_have_their_score_at_their_own_end(folder):
-    """Rewards by hand, advantages as brute-force sums, with a critic that says something."""
+    """Rewards by hand, advantages as brute-force sums, with a non-trivial critic."""
     roles, experience = experienced(settings(folder))
     rewards = rewards_of(experience, SCORES, roles.settings, 0.05).rewards
     batch = batch_of(experience, rewards, EVERY, roles.settings)
@@ -96,7 +94,7 @@ def test_looking_at_responses_in_parts_changes_nothing(folder, micro):
 
 
 def poisoned(experience):
-    """NaN in every number behind the end of a response."""
+    """NaN in every number after the end of a response."""
     mask = experience.responses.mask
     names = ("logp", "ref_logp", "entropy", "exact", "values")
     dirty = {name: torch.where(mask, getattr(experience, name), torch.nan) for name in names}
@@ -124,7 +122,7 @@ def test_nan_behind_a_response_reaches_no_reward_advantage_or_metric(folder, val
 
 
 def test_a_response_that_ended_is_terminal_where_cut_ones_are_bootstrapped(folder):
-    """With V = 0.7 everywhere and no reward the last advantage is -0.7, or 0 where the critic goes on."""
+    """With V = 0.7 everywhere and no reward, the last advantage is -0.7, or 0 if the critic bootstraps."""
     ended = torch.tensor([True, False] * 3)
     for truncation, cut in (("terminal", -0.7), ("bootstrap", 0.0)):
         present = settings(folder, truncation=truncation)
@@ -139,7 +137,7 @@ def test_a_response_that_ended_is_terminal_where_cut_ones_are_bootstrapped(folde
 
 
 def test_tokens_of_which_the_policy_is_certain_count(folder):
-    """Their log-probability is 0: what counts is said by the mask, never by a number."""
+    """Their log-probability is 0: only the mask decides which tokens count, never a number."""
     roles, experience = experienced(settings(folder, top_k=1))
     mask = experience.responses.mask
     assert (experience.responses.logp[mask] == 0).all() and (experience.logp[mask] == 0).all()
@@ -150,7 +148,7 @@ def test_tokens_of_which_the_policy_is_certain_count(folder):
 
 
 def test_every_stop_of_the_generation_settings_ends_a_response_and_pays_no_penalty(folder):
-    """The penalty is subtracted from the score, which goes on telling responses apart."""
+    """The penalty is subtracted from the score, which still distinguishes responses."""
     roles, experience = experienced(settings(folder, missing_eos_penalty=1.5, max_new_tokens=3))
     assert roles.eos == STOPS
     responses, rows = experience.responses, torch.arange(6)
@@ -181,7 +179,7 @@ def test_whitened_rewards_are_divided_by_the_deviation_of_what_counts_and_keep_t
 
 def test_every_metric_of_a_rollout_by_hand():
     """Three responses of 2, 3 and 1 tokens; sums over a response, means where named so. The second has no
-    score: it tells of the policy as the others do, and of the reward nothing.
+    score: it counts in the metrics of the policy, but not in those of the reward.
     """
     nan = math.nan
     mask = torch.tensor([[True, True, False], [True, True, True], [True, False, False]])
@@ -229,7 +227,7 @@ def test_every_metric_of_a_rollout_by_hand():
 
 
 def test_without_a_signal_nothing_is_learnt_from_rounding(folder):
-    """Sampling and training differ by 1e-7; normalised advantages would make full steps of that."""
+    """Sampling and training differ by 1e-7; normalised advantages would turn that into full steps."""
     roles = fresh(settings(folder))
     experience = gather(roles, PROMPTS, 1, 0, 2)
     assert not torch.equal(experience.responses.logp, experience.logp)
@@ -249,7 +247,7 @@ def test_the_share_of_the_kl_has_nothing_of_the_score(folder):
 
 
 def test_where_no_response_counts_the_kl_is_known_and_the_score_is_not(folder):
-    """A KL of 0 there would lift every budget, and be a false point of the over-optimisation curve."""
+    """A KL of 0 there would disable every budget, and add a false point to the over-optimisation curve."""
     _, experience = experienced(settings(folder))
     experience.ref_logp -= 1.0
     nothing = torch.zeros(6, 10)
@@ -260,7 +258,7 @@ def test_where_no_response_counts_the_kl_is_known_and_the_score_is_not(folder):
 
 
 def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(folder):
-    """The log-probabilities trained against come from the pass that trains, not from the KV cache."""
+    """The old log-probabilities come from the training pass, not from the KV cache."""
     roles, experience = experienced(settings(folder, dtype="bfloat16"))
     batch = batch_of(experience, torch.zeros(6, 10), EVERY, roles.settings)
     with torch.no_grad():
@@ -270,7 +268,7 @@ def test_in_bfloat16_the_first_ratios_are_1_though_sampling_rounds_otherwise(fol
     assert trained < 1e-3 < 1e-2 < sampled
 
 
-def test_a_response_without_a_sibling_that_counts_is_compared_with_nobody():
+def test_a_response_without_a_valid_sibling_has_no_baseline():
     valid = np.array([True, False, False, True, True, True, True, False, False])
     assert has_baseline(valid, 3).tolist() == [False] * 3 + [True] * 3 + [False] * 3
     assert has_baseline(np.array([True, True, False]), 3).tolist() == [True, True, False]

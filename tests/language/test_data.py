@@ -1,4 +1,4 @@
-"""Rows to tokens: every format, what is learnt of it, and an error or a count for whatever does not fit."""
+"""Rows to tokens: every format, its learnt tokens, and an error or a count for rows that do not fit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CHAT = [
 
 
 def chatml():
-    """As SmolLM2 has it: PAD is the EOS, and a newline follows the EOS of every turn."""
+    """Like SmolLM2: PAD is the EOS, and a newline follows the EOS of every turn."""
     made = tokenizer()
     made.chat_template = CHATML
     made.pad_token = "<eos>"
@@ -46,7 +46,7 @@ def chatml():
 
 
 def opening(template: str):
-    """A tokenizer that puts its own tokens around every text."""
+    """A tokenizer that adds its own tokens around every text."""
     from tokenizers import processors
 
     made = tokenizer()
@@ -87,8 +87,8 @@ def test_every_kind_of_file_gives_the_same_rows(tmp_path):
     assert read_rows(tmp_path / "x.txt") == ["one", "  two "]
 
 
-def test_lists_and_whatever_yields_rows():
-    class Dataset:  # as datasets.Dataset does: it yields dicts, and is no list
+def test_lists_and_other_iterables_of_rows():
+    class Dataset:  # like datasets.Dataset: it yields dicts, and is not a list
         def __iter__(self):
             return iter([{"text": "a"}, {"text": "b"}])
 
@@ -174,14 +174,14 @@ def test_text_is_learnt_from_its_second_token_to_its_eos():
 
 
 @pytest.mark.parametrize("make", [lambda: tokenizer(chat=True), chatml])
-def test_completions_alone_are_learnt_with_their_eos(make):
+def test_only_completions_are_learnt_with_their_eos(make):
     made = make()
     messages = {"prompt": CHAT[:2], "completion": CHAT[2:3]}
     mixed = {"prompt": CHAT[:2], "completion": "hi you"}
     for row in ({"prompt": "ask. ", "completion": "hi you"}, messages, mixed):
         (example,) = examples([row], made)
         assert learnt(example, made) == "hi you<eos>"
-        assert example.tokens[-1] == EOS and example.learn[-1]  # nothing behind it, not even a newline
+        assert example.tokens[-1] == EOS and example.learn[-1]  # nothing after it, not even a newline
 
 
 def test_every_assistant_turn_is_learnt_and_nothing_else():
@@ -192,7 +192,7 @@ def test_every_assistant_turn_is_learnt_and_nothing_else():
     (example,) = examples([{"messages": CHAT}], made, on_completions=False)
     assert learnt(example, made) + "\n" == made.apply_chat_template(CHAT, tokenize=False)[len("<bos>") :]
     (example,) = examples([{"prompt": CHAT[:4], "completion": CHAT[4:]}], made)
-    assert learnt(example, made) == "no.<eos>"  # earlier turns of the assistant are the prompt's
+    assert learnt(example, made) == "no.<eos>"  # earlier assistant turns belong to the prompt
 
 
 def test_a_template_without_eos_gets_one_at_the_end():
@@ -211,7 +211,7 @@ def test_a_template_without_eos_gets_one_at_the_end():
     ids=["text", "completion", "messages"],
 )
 def test_the_padding_token_is_never_asked(row):
-    """PAD of its own, PAD equal to EOS, no PAD: the same tokens, and the EOS is learnt."""
+    """Separate PAD, PAD equal to EOS, no PAD: the same tokens, and the EOS is learnt."""
     found = []
     for pad in ("<pad>", "<eos>", None):
         made = tokenizer(chat=True)
@@ -223,7 +223,7 @@ def test_the_padding_token_is_never_asked(row):
 
 @pytest.mark.parametrize("template", ["$A", "<bos> $A", "<bos> $A <eos>"])
 def test_what_is_sampled_is_what_is_trained(template):
-    """A prompt has the same tokens in an example as when it is responded to."""
+    """A prompt has the same tokens in an example as in generation."""
     made = opening(template)
     made.chat_template = CHATML
     for ask, reply in (("ask. ", "reply"), (CHAT[:2], CHAT[2:3])):
@@ -231,7 +231,7 @@ def test_what_is_sampled_is_what_is_trained(template):
         (example,) = examples([{"prompt": ask, "completion": reply}], made)
         assert example.tokens[: len(prompt.tokens)] == prompt.tokens
         assert not any(example.learn[: len(prompt.tokens)]) and all(example.learn[len(prompt.tokens) :])
-        assert prompt.tokens[-1] != EOS  # the EOS that some tokenizers add would end the prompt
+        assert prompt.tokens[-1] != EOS  # an EOS that some tokenizers add would end the prompt
         assert example.tokens.count(EOS) == 1 + 2 * (not isinstance(ask, str))
 
 
@@ -289,7 +289,9 @@ def test_long_rows_are_cut_and_counted():
         UserWarning, match=r"2 of 3 rows have more than max_tokens 5 .* 1 of 3 rows have nothing"
     ):
         first, last = examples(rows, max_tokens=5)
-    assert whole(first) == "abcde" and learnt(first) == "de"  # cut: no EOS is learnt where no text ended
+    assert (
+        whole(first) == "abcde" and learnt(first) == "de"
+    )  # cut: no EOS is learnt, because the text did not end
     assert whole(last) == "ab<eos>"
     heard = []
     examples(rows, max_tokens=5, notify=heard.append)
@@ -338,7 +340,7 @@ def test_templates_that_cannot_serve_are_named():
     made.chat_template = "{{ raise_exception('roles must alternate') }}"
     with pytest.raises(ValueError, match=r"data\[0\]: the chat template refuses .*roles must alternate"):
         examples([{"messages": CHAT}], made)
-    made.chat_template = (  # earlier replies are shortened, as templates of thinking models do
+    made.chat_template = (  # earlier replies are shortened, as in templates of thinking models
         "{% for m in messages %}{{ m['content'] if loop.last else m['content'][:2] }}<eos>{% endfor %}"
     )
     with pytest.raises(ValueError, match=r"rewrites earlier turns .* prompt, the reply as completion"):
@@ -392,7 +394,7 @@ def test_pairs_share_their_prompt_and_end_with_eos(row, prompt, chosen, rejected
     assert made.decode(list(pair.rejected[n:])) == rejected
 
 
-def test_pairs_that_say_nothing_are_counted():
+def test_uninformative_pairs_are_counted():
     rows = [
         {"prompt": "ask", "chosen": "yes", "rejected": "yes"},
         {"prompt": "ask", "chosen": "yes a", "rejected": "yes b"},
@@ -431,7 +433,7 @@ def test_long_prompts_lose_their_beginning():
     assert made.decode(list(short.tokens)) == "<bos>abc" and short.shown == "abc"
 
 
-def test_a_long_chat_loses_its_beginning_and_is_said_to_be_shown_whole():
+def test_a_long_chat_loses_its_beginning_with_a_message():
     made, heard = chatml(), []
     rows = [{"prompt": CHAT[:2]}, "abcdefghijklmno"]
     chat, _ = read_prompts(rows, made, max_tokens=12, notify=heard.append)
@@ -461,7 +463,7 @@ def test_a_bad_prompt_is_named(row, message):
 
 
 @pytest.mark.parametrize("filler", [0, 7, EOS])
-def test_padding_is_said_by_the_mask(filler):
+def test_only_the_mask_defines_padding(filler):
     rows = [[5], [6, 7, 8], []]
     tokens, real = pad_left(rows, filler)
     assert tokens.dtype == torch.int64 and real.dtype == torch.bool

@@ -1,4 +1,4 @@
-"""Models that are not quite a Llama: scaled or capped logits, windows of attention, layers further down."""
+"""Models that differ from a Llama: scaled or capped logits, attention windows, more deeply nested layers."""
 
 from pathlib import Path
 
@@ -60,7 +60,7 @@ def made(name):
 
 @pytest.mark.parametrize("name", ["granite", "cohere"])
 def test_a_factor_behind_the_head_is_in_what_is_sampled_and_trained(name):
-    """At any temperature, forwards and back, as transformers' own logits say."""
+    """At any temperature, forward and backward, the same as transformers' own logits."""
     model = made(name)
     tokens, real, sampling = torch.randint(4, 60, (2, 12)), torch.ones(2, 12, dtype=torch.bool), Sampling(0.7)
     wanted = (model(tokens).logits[:, :-1].double() / 0.7).log_softmax(2)
@@ -89,7 +89,7 @@ def test_the_factor_is_exact_and_a_plain_head_has_none():
     ("name", "words"), [("capped", r"gemma2.*soft-capped.*not\s+supported"), ("opt350", "head that reads 16")]
 )
 def test_what_is_no_factor_times_the_head_is_refused_by_name(name, words, tmp_path):
-    """A cap of 30 does next to nothing to the logits of this model: it is seen all the same."""
+    """A cap of 30 barely changes the logits of this model, but is still detected."""
     with pytest.raises(ValueError, match=words):
         parts(made(name))
     with pytest.raises(ValueError, match=words):
@@ -106,7 +106,7 @@ def test_hidden_states_that_are_changed_before_the_head_are_refused():
 @pytest.mark.parametrize("name", ["qwen2", "gemma3"])
 @pytest.mark.parametrize("cut", [1, 2, 3])
 def test_halves_keep_each_layer_s_window(name, cut):
-    """Rows are longer than the window, and the trunk's own look at itself is shorter."""
+    """Rows are longer than the window, and the trunk's self-check is shorter."""
     model = made(name)
     tokens, real, _ = padded(rows=3, prompt=20, response=20)
     trunk = Trunk(model, cut)
@@ -117,7 +117,7 @@ def test_halves_keep_each_layer_s_window(name, cut):
 
 
 def test_halves_that_mix_up_windows_are_not_used(monkeypatch):
-    """The look that a trunk takes at itself sees a wrong window, however wide the real one is."""
+    """A trunk's self-check detects a wrong window, however wide the real one is."""
     from tightrope.language.model import trunk
 
     real = trunk._halves
@@ -156,7 +156,7 @@ def test_packing_is_refused_where_masks_are_read_in_another_way():
 
 @pytest.mark.parametrize("name", ["granite", "opt", "bloom", "gemma2"])
 def test_the_doctor_finds_them_healthy(name, tmp_path):
-    """Also those without fused attention, and whose layers lie a module further down."""
+    """Also models without fused attention, or with layers nested one module deeper."""
     folder = saved(tmp_path, made(name))
     assert [finding for finding in selfcheck.check_model(folder) if not finding.good] == []
     assert ledger(config_of(name), Job(batch_size=2, prompt_tokens=4, response_tokens=4)).total > 0
@@ -185,7 +185,7 @@ def test_a_reward_model_without_fused_attention_loads(tmp_path):
 
 
 @pytest.mark.parametrize(("dtype", "limit"), [("float32", LOG_RATIO_LIMIT), ("bfloat16", LOWERED_LIMIT)])
-def test_sampling_and_training_may_differ_by_rounding_alone_in_every_precision(dtype, limit):
+def test_sampling_and_training_may_differ_only_by_rounding_in_every_precision(dtype, limit):
     refuse_mismatch(limit, limit, dtype, first=True)
     for gap in (limit * 1.01, float("nan")):
         with pytest.raises(SamplingMismatch, match=r"KV cache.*window"):

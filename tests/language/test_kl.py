@@ -1,4 +1,4 @@
-"""The KL to the reference: a language is written down whole, and expectations are sums over all responses."""
+"""The KL to the reference: a whole language is enumerated, and expectations are sums over all responses."""
 
 import dataclasses
 import math
@@ -45,11 +45,11 @@ class World:
 
     @property
     def of_scores(self) -> Tensor:
-        """The gradient of E[score] alone."""
+        """The gradient of only E[score]."""
         return gradient_of(objective(self.policy, self.reference, self.scores, 0.0), self.policy)
 
     def per_state(self, *, forward: bool = False, visits: Tensor | None = None) -> Tensor:
-        """The gradient of the states' own KL (or of KL(reference || policy)), states as often as visited."""
+        """The gradient of the states' own KL (or of KL(reference || policy)), weighted by visits."""
         states = self.language.states(self.language.tokens)
         pair = [Categorical(logits=model.logits[states]) for model in (self.policy, self.reference)]
         kl = kl_divergence(*(pair[::-1] if forward else pair))
@@ -57,7 +57,7 @@ class World:
         return gradient_of(torch.where(self.language.mask, often[:, None] * kl, 0.0).sum(), self.policy)
 
     def rewards(self, form: str, scores: Tensor) -> Tensor:
-        """Rewards per token of every response: the score at the end, and what the form adds."""
+        """Rewards per token of every response: the score at the end, and the form's KL term."""
         tokens, mask = self.language.tokens, self.language.mask
         with torch.no_grad():
             parts = (self.policy.logp(tokens), self.reference.logp(tokens))
@@ -65,9 +65,9 @@ class World:
         return with_scores(kl_rewards(form, KL_BETA, *parts, exact, mask), scores, mask)
 
     def expected(self, form: str, scores: Tensor, values: Tensor, gae_lambda: float = 1.0) -> Tensor:
-        """The expected gradient (uphill) that training follows: the product's own functions, every response.
+        """The expected gradient (uphill) of training: the library's own functions, over every response.
 
-        Each response alone is a minibatch with count 1, so that its loss is the sum over its steps.
+        Each response is its own minibatch with count 1, so that its loss is the sum over its steps.
         """
         tokens, mask, policy = self.language.tokens, self.language.mask, self.policy
         logp, ref_logp = policy.logp(tokens), self.reference.logp(tokens)
@@ -84,7 +84,7 @@ class World:
         return -gradient_of(total, policy)
 
     def some_values(self) -> Tensor:
-        """Values of an arbitrary critic: numbers that depend on the state alone."""
+        """Values of an arbitrary critic: numbers that depend only on the state."""
         return self.policy.values.detach()[self.language.states(self.language.tokens)]
 
     def true_values(self, form: str) -> Tensor:
@@ -114,7 +114,7 @@ def test_expected_gradient_is_that_of_the_objective(form: str, seed: int) -> Non
 
 @pytest.mark.parametrize("form", ["k1-reward", "exact-split"])
 def test_a_perfect_critic_makes_it_exact_at_any_lambda(form: str) -> None:
-    """Rewards lie where the critic expects them: V(s) is the mean of what still follows from s."""
+    """Rewards match the critic: V(s) is the mean of the rewards after s."""
     world = World(0)
     found = world.expected(form, world.scores, world.true_values(form), gae_lambda=0.3)
     torch.testing.assert_close(found, world.right, **EXACT)
@@ -129,7 +129,7 @@ def test_loss_forms_have_the_gradient_of_the_states_own_kl(form: str) -> None:
     assert off_by(found, world.right) > 0.05, "later states are not seen, so it cannot be the whole gradient"
 
 
-def test_one_state_alone() -> None:
+def test_a_single_state() -> None:
     """Responses of one token: all forms agree with autograd."""
     world = World(3, words=5, length=1)
     for form in KL_FORMS:
@@ -164,7 +164,7 @@ def test_weights_make_up_for_actions_of_an_older_policy(form: str) -> None:
 
 
 class Rollout:
-    """A batch with every response as often as the policy says it, so that a mean is an expectation.
+    """A batch with every response as often as its probability, so that a mean is an expectation.
 
     Probabilities are 1/2, 1/4 and 1/4 in every state: 64 rows hold all three-token responses in proportion.
     """
@@ -193,7 +193,7 @@ class Rollout:
     def step(
         self, form: str, batch: Batch, *, normalise: bool = False, scale: float | Tensor = 1.0
     ) -> Tensor:
-        """What one step of ppo.update, a plain gradient step of size 1, changes in the logits."""
+        """The change of the logits in one step of ppo.update, a plain gradient step of size 1."""
         policy = self.world.policy
         before = policy.logits.detach().clone()
 

@@ -1,4 +1,4 @@
-"""One word for the cache, whatever transformers calls it: the name up to 5.23, and the one from 5.24 on."""
+"""The KV cache works under both names in transformers: the one up to 5.23, and the one from 5.24 on."""
 
 import warnings
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ from tightrope.language.generation.sample import cached_forward
 
 
 class NewName(nn.Module):
-    """As from 5.24 on: the old name still works and warns, as an argument and in the output."""
+    """Like 5.24 and later: the old name still works and warns, as an argument and in the output."""
 
     class Output(SimpleNamespace):
         @property
@@ -26,7 +26,7 @@ class NewName(nn.Module):
 
 
 class OldName(nn.Module):
-    """As up to 5.23."""
+    """Like 5.23 and earlier."""
 
     def forward(self, tokens, attention_mask=None, position_ids=None, past_key_values=None, use_cache=None):
         cache = [*(past_key_values or []), tokens]
@@ -43,7 +43,7 @@ def test_the_cache_goes_in_and_comes_out_under_either_name(model):
 
 
 def test_a_step_with_the_cache_is_the_whole_pass_of_the_installed_version(capfd):
-    """No warning either: the test settings make warnings errors, and transformers logs some to stderr."""
+    """Without warnings: the test settings make them errors, and transformers logs some to stderr."""
     base, tokens = tiny_llama().model, torch.tensor([[3, 4, 5]])
     places, ones = torch.arange(3)[None], torch.ones(1, 3, dtype=torch.int64)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The ledger beside the real thing: tiny models that are really built, run and optimised."""
+"""The ledger against reality: tiny models that are actually built, run and optimised."""
 
 import dataclasses
 from pathlib import Path
@@ -145,7 +145,7 @@ def test_a_model_of_seven_billion_takes_no_memory_to_be_counted() -> None:
 
 
 def test_what_cannot_be_measured_is_estimated(monkeypatch) -> None:
-    """A layer that looks at numbers fails where there are none."""
+    """A layer that reads values fails on tensors without values."""
     measured = memory.shapes_of(LLAMA, "float32").saved
 
     def fails(base, length):
@@ -206,7 +206,7 @@ def test_supervised_jobs_hold_one_model_and_sample_nothing() -> None:
 
 @CONFIGS
 def test_weights_that_are_trained_in_full_stay_float32_beside_their_lowered_copies(config) -> None:
-    """What load() does: --dtype bfloat16 is no saving there, and is not advised."""
+    """Like load(): --dtype bfloat16 saves nothing there, and is not suggested."""
     model = real(config)
     found = ledger(config, job_of(SFTSettings(tune="full", dtype="bfloat16")))
     assert entry(found, "model: weights of the trunk") == size_of(model.parameters())
@@ -222,7 +222,7 @@ def test_a_reward_model_does_not_train_the_language_head() -> None:
     assert entry(found, "model: gradients") == size_of(parts(real(LLAMA)).base.parameters())
 
 
-def test_a_job_that_fits_passes_and_one_that_does_not_is_told_what_helps() -> None:
+def test_a_job_that_fits_passes_and_one_that_does_not_gets_advice() -> None:
     job = dataclasses.replace(ALIGN, tune="full", critic="separate", micro_batch_size=16)
     found = ledger(LLAMA, job)
     require_fit(found, None)
@@ -303,7 +303,7 @@ def test_control_groups_of_the_first_version(tmp_path: Path) -> None:
     assert available_memory("cpu", machine(tmp_path, {**MEMINFO, **files})) == 0
 
 
-def test_this_machine_says_something() -> None:
+def test_the_memory_of_this_machine_is_none_or_positive() -> None:
     assert available_memory("cpu") is None or available_memory("cpu") > 0
 
 
@@ -352,9 +352,7 @@ def test_a_reward_model_and_a_gold_judge_count_by_their_own_size_in_float32(fold
     found, text = told(dataclasses.replace(settings, gold=judge), own_reward=True)
     assert [entry.size for entry in found.rows if entry.what == row] == [size, size]
     assert text.count(row) == 2 and "reward model: weights" not in text
-    assert (
-        "reward model" not in told(settings)[1]
-    )  # the reward lies on the trunk, the gold judge is a function
+    assert "reward model" not in told(settings)[1]  # the reward is on the trunk, the gold judge is a function
 
 
 def test_a_reward_model_that_is_not_known_is_taken_for_one_as_large_as_the_policy(folders) -> None:

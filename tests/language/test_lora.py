@@ -1,4 +1,4 @@
-"""Adapters: they begin as nothing, keep to themselves, and PEFT reads them."""
+"""Adapters: they start without effect, do not affect each other, and PEFT reads them."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def adapted(make, *names, layers=None):
 
 
 def shake(model, name, seed=0):
-    """Weights of an adapter that change something: B is no longer 0."""
+    """Adapter weights with an effect: B is no longer 0."""
     generator = torch.Generator().manual_seed(seed)
     for parameter in lora.adapter_parameters(model, name):
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=generator)
@@ -38,8 +38,8 @@ def test_a_new_adapter_changes_nothing_and_a_shaken_one_does(make):
 
 
 @pytest.mark.parametrize("make", MODELS)
-def test_every_role_gets_the_gradient_it_gets_alone(make):
-    """Three roles in one graph, switched between, one backward pass: nobody's gradient is lost or mixed."""
+def test_every_role_gets_the_same_gradient_as_on_its_own(make):
+    """Three roles in one graph with switches and one backward pass: no gradient is lost or mixed."""
     tokens, real, _ = padded()
     names = ("policy", "critic", "reward")
 

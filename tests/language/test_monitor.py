@@ -1,4 +1,4 @@
-"""The over-optimisation monitor: Gao's curve is found again; alarms come when they should and only then."""
+"""The over-optimisation monitor: it recovers Gao's curve, and alarms come only when they should."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PEAK_KL = math.exp(ALPHA / BETA - 1) ** 2  # 20.1 nats
 
 
 def curve(kl, alpha=ALPHA, beta=BETA, offset=OFFSET):
-    """Gao, Schulman & Hilton 2022, with an offset; written apart from the code under test."""
+    """Gao, Schulman & Hilton 2022, with an offset; independent of the code under test."""
     d = np.sqrt(kl)
     return offset + d * alpha - np.where(d > 0, beta * d * np.log(np.maximum(d, 1e-300)), 0.0)
 
@@ -56,7 +56,7 @@ def test_the_peak_is_where_the_curve_is_highest():
 
 
 def test_the_interval_covers_the_peak_as_often_as_it_says():
-    """80 %, within what 300 runs can tell."""
+    """80 %, within the precision of 300 runs."""
     rng, covered, errors, explained = np.random.default_rng(1), 0, [], []
     for _ in range(300):
         found = fit(noisy_run(rng, np.linspace(0.2, 30, 20), noise=0.03))
@@ -102,7 +102,7 @@ def test_points_that_are_too_much_alike_once_squared_are_named_and_raise_nothing
 
 
 @pytest.mark.parametrize("count", range(FEWEST_POINTS))
-def test_too_few_points_are_said_to_be_too_few(count):
+def test_too_few_points_are_reported(count):
     found = fit([(float(kl), curve(kl)) for kl in range(count)])
     assert found.reason == f"{count} points at different KLs, at least {FEWEST_POINTS} are needed"
     assert math.isnan(found.peak_kl) and math.isnan(found.gold(1.0)) and not found.decided
@@ -112,7 +112,7 @@ def test_many_points_at_one_kl_are_few_points():
     assert "1 points" in fit([(3.0, 0.1 * i) for i in range(20)]).reason
 
 
-def test_kls_that_hardly_differ_are_said_to_be_too_near():
+def test_kls_that_hardly_differ_are_reported_as_too_close():
     found = fit([(kl, curve(kl)) for kl in np.linspace(10, 20, 12)])
     assert found.reason == "the KLs reach from 10 to 20, too close to each other"
 
@@ -140,7 +140,7 @@ def test_a_constant_gold_score_decides_nothing():
 
 
 def test_noise_decides_nothing():
-    """Gold that has nothing to do with KL: a peak is predicted for few of 200 such runs."""
+    """Gold scores unrelated to KL: a peak is predicted for few of 200 such runs."""
     rng = np.random.default_rng(2)
     decided = [
         fit([(kl, rng.standard_normal()) for kl in np.linspace(0.1, 10, 10)]).decided for _ in range(200)
@@ -179,7 +179,7 @@ def test_the_alarm_after_the_peak_comes_too():
 
 
 def test_a_gold_score_that_rises_with_the_proxy_gives_hardly_an_alarm():
-    """Forty evaluations of a run that gets better all the time."""
+    """Forty evaluations of a run that improves all the time."""
     rng, alarms = np.random.default_rng(5), 0
     for _ in range(50):
         points = [(kl, 0.3 * math.sqrt(kl) + 0.02 * rng.standard_normal()) for kl in np.linspace(0, 10, 40)]
@@ -256,7 +256,7 @@ def test_few_points_on_the_curve_decide_where_the_top_is():
 
 
 @given(cut=st.integers(0, 30))
-def test_a_restored_monitor_goes_on_as_if_nothing_had_happened(cut):
+def test_a_restored_monitor_continues_without_a_difference(cut):
     rng = np.random.default_rng(8)
     points = noisy_run(rng, np.linspace(0, 40, 30), noise=0.02)
     proxy = [math.nan if i == 3 else float(i) for i in range(30)]

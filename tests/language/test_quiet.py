@@ -1,4 +1,4 @@
-"""No warning and no progress bar of a library reaches the terminal, and nothing stays switched off after."""
+"""No warning or progress bar of a library reaches the terminal, and all switches are restored afterwards."""
 
 import os
 import subprocess
@@ -78,7 +78,7 @@ def test_warnings_of_a_users_own_code_and_of_other_kinds_are_shown(module, categ
 
 @pytest.mark.parametrize("off", [True, False])
 def test_the_bars_of_the_hub_are_as_they_were(off):
-    """transformers switches them together with its own; a user may have switched off the hub's only."""
+    """transformers switches them together with its own; a user may have disabled only the hub's."""
     from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
 
     before = are_progress_bars_disabled()

@@ -1,4 +1,4 @@
-"""The reward model: the loss by hand, scores by the mask, a scale that is saved, a folder others load."""
+"""The reward model: the loss by hand, scores by the mask, a saved scale, a folder that others can load."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def settings_of(folder: str = "", **values) -> RewardSettings:
 
 
 def preferences(count: int = 120, seed: int = 0) -> list[dict[str, str]]:
-    """Of two words the one with more x is preferred."""
+    """The word with more x is preferred."""
     generator = np.random.default_rng(seed)
     rows = []
     while len(rows) < count:
@@ -99,8 +99,8 @@ def test_the_last_real_token_is_found_by_the_mask():
 
 @pytest.mark.parametrize("make", MODELS)
 @pytest.mark.parametrize("filler", [0, EOS, 50])
-def test_padding_is_nothing_to_a_score(make, filler):
-    """Any side, any amount, any id: also the id of the EOS that ends every text."""
+def test_padding_does_not_affect_a_score(make, filler):
+    """Any side, any amount, any id, including the id of the EOS that ends every text."""
     model, texts = scorer(make), [[5, 6, EOS], [7, 8, 9, 10, EOS], [11, EOS]]
     alone = torch.cat([model.score(*pad_right([text])) for text in texts])
     for pad in (pad_left, pad_right):
@@ -153,7 +153,7 @@ def test_calibration_by_hand():
     assert calibration(torch.tensor([1000.0]))[0] == pytest.approx(0.0)
 
 
-def test_calibration_tells_honest_from_overconfident():
+def test_calibration_distinguishes_honest_from_overconfident():
     generator = torch.Generator().manual_seed(0)
     difference = 2 * torch.randn(20_000, generator=generator)
     right = torch.rand(20_000, generator=generator) < torch.sigmoid(difference.abs())
@@ -246,7 +246,7 @@ def test_scores_are_normalised_on_the_demonstrations_that_are_given(tmp_path, fo
 
 
 def test_where_padding_is_the_eos_transformers_refuses_batches(tmp_path):
-    """It would read the score before the EOS, and say nothing."""
+    """It would silently read the score before the EOS."""
     from transformers import AutoModelForSequenceClassification
 
     base, made = tiny_llama(), tokenizer()
@@ -266,7 +266,7 @@ def test_where_padding_is_the_eos_transformers_refuses_batches(tmp_path):
 
 
 def test_the_adapter_scores_alike_on_a_trunk_that_is_shared(tmp_path, folder):
-    """What alignment does: the adapter and its head on the trunk that the policy uses."""
+    """As in alignment: the adapter and its head on the policy's trunk."""
     from safetensors.torch import load_file
 
     rows = preferences(60)
@@ -305,7 +305,7 @@ def test_peft_opens_the_adapter_with_its_head(tmp_path, make):
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
 
 
-def test_the_run_folder_tells_what_happened(tmp_path, folder):
+def test_the_run_folder_records_what_happened(tmp_path, folder):
     data = tmp_path / "pairs.jsonl"
     data.write_text("".join(json.dumps(row) + "\n" for row in preferences(40)))
     settings = settings_of(folder, data=str(data), validation=str(data), num_epochs=1)
@@ -327,7 +327,7 @@ def test_the_run_folder_tells_what_happened(tmp_path, folder):
 
 def test_same_seed_same_bits_other_seed_others(tmp_path, folder):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        torch.manual_seed(seed + ord(name))  # the global generator has no say
+        torch.manual_seed(seed + ord(name))  # the global generator has no effect
         train_reward(
             settings_of(folder, seed=seed, num_epochs=1), data=preferences(30), run_dir=tmp_path / name
         )

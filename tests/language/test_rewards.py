@@ -1,4 +1,4 @@
-"""Reward functions: called as TRL calls them, and whatever they do, no wrong number comes of it."""
+"""Reward functions: called as in TRL; whatever they return, no wrong number results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def score(*functions, columns=None, **settings):
 
 
 def constant(*values):
-    """A reward function that returns this list, whatever it is given."""
+    """A reward function that always returns this list."""
     return lambda **_: list(values)
 
 
@@ -109,7 +109,7 @@ def test_the_prompt_column_is_not_passed_twice_and_other_clashes_are_named():
 
 
 @pytest.mark.parametrize("on_error", ["mask", "raise", None])
-def test_a_function_that_wants_what_is_not_there_is_told_what_is(on_error):
+def test_a_function_with_an_unknown_argument_gets_the_list_of_columns(on_error):
     def accuracy(completions, answers):
         return [0.0] * len(completions)
 
@@ -194,8 +194,8 @@ def test_a_sample_that_no_function_applies_to_is_masked_and_never_a_zero():
 @pytest.mark.parametrize(
     "bad", [math.nan, math.inf, -math.inf, 1e39, 10**400, torch.tensor(math.nan)], ids=str
 )
-def test_a_score_that_is_not_finite_masks_its_sample_whatever_the_others_say(bad):
-    """1e39 is finite here and infinite in float32, in which it would be trained on."""
+def test_a_score_that_is_not_finite_masks_its_sample_despite_other_scores(bad):
+    """1e39 is finite here, but infinite in float32, the type of training."""
     found = score(constant(1.0, bad, 3.0), length)
     assert found.valid.tolist() == [True, False, True]
     assert np.array_equal(found.total, [3.0, math.nan, 6.0], equal_nan=True)
@@ -301,7 +301,7 @@ def test_a_run_in_which_nothing_can_be_scored_ends():
         rewards.score(PROMPTS, TEXTS, IDS)
 
 
-def test_one_scored_batch_starts_the_count_anew():
+def test_one_scored_batch_restarts_the_count():
     answers = iter([[None], [None], [1.0], [None], [None]])
     rewards = Rewards([lambda **_: next(answers)])
     valid = [bool(rewards.score(["p"], ["c"], [[1]]).valid[0]) for _ in range(5)]
@@ -312,7 +312,7 @@ def test_one_scored_batch_starts_the_count_anew():
 
 
 def test_async_functions_run_together():
-    """Each waits for the other: one after the other they would both be late."""
+    """Each waits for the other: in sequence both would time out."""
     begun = []
 
     async def meet(completions, me):
@@ -400,7 +400,7 @@ def test_an_exception_in_a_coroutine_is_reported():
 
 
 def test_all_batches_share_one_event_loop():
-    """A client that a function keeps belongs to the loop in which it was made."""
+    """A client that a function keeps belongs to the event loop in which it was created."""
     loops = []
 
     async def reward(completions):
@@ -512,7 +512,7 @@ def test_an_empty_batch_has_no_scores_and_no_faults():
 
 @pytest.fixture
 def folder(tmp_path: Path):
-    """A folder for reward files; what they import is forgotten."""
+    """A folder for reward files; their imports are removed afterwards."""
     path, modules = list(sys.path), set(sys.modules)
     yield tmp_path
     sys.path[:] = path

@@ -1,4 +1,4 @@
-"""Four roles on one trunk: who trains what, what is shared, and that it equals models kept apart."""
+"""Four roles on one trunk: trained and shared weights, and equality with separate models."""
 
 import dataclasses
 
@@ -82,7 +82,7 @@ def test_an_update_moves_policy_and_critic_and_never_the_reference(folder, tune,
 @pytest.mark.parametrize("tune, critic", LAYOUTS)
 @pytest.mark.parametrize("kl", ["k1-reward", "exact-split"])
 def test_the_pass_of_the_rollout_is_the_first_of_the_update(folder, tune, critic, kl):
-    """What is said with gradients kept, to rows in another order, is what a pass of its own says."""
+    """A pass that keeps its graph, with rows in another order, equals a separate pass."""
     roles = fresh(settings(folder, tune=tune, critic=critic, kl=kl))
     parameters = list(roles.parameters())
     with torch.no_grad():
@@ -110,12 +110,12 @@ def test_the_pass_of_the_rollout_is_kept_only_where_one_pass_is_an_epoch(folder,
     assert not present.with_values(micro_batch_size=6).one_pass
     roles = fresh(present)
     assert gather(roles, PROMPTS, 1, 0, 2).first_pass is None
-    monkeypatch.setattr(batching, "PASS", 0)  # then every length is worth a group
+    monkeypatch.setattr(batching, "PASS", 0)  # then every length gets its own group
     assert gather(roles, PROMPTS, 1, 0, 2, keep=True).first_pass is None
 
 
 def experienced_again(roles, batch):
-    """The same rows with the log-probabilities of the policy as it is now."""
+    """The same rows with the log-probabilities of the current policy."""
     with torch.no_grad():
         now = PolicyModel(roles)(batch)
     return dataclasses.replace(batch, old_logp=now.logp)
@@ -159,7 +159,7 @@ def test_micro_batches_add_up(folder, critic):
         gradients.append([p.grad.clone() for p in roles.parameters()])
     for other in gradients[1:]:
         for a, b in zip(gradients[0], other, strict=True):
-            assert (a - b).norm() <= 1e-4 * a.norm() + 1e-7  # sums in another order, nothing else
+            assert (a - b).norm() <= 1e-4 * a.norm() + 1e-7  # only the order of sums differs
 
 
 def shake(roles):

@@ -1,4 +1,4 @@
-"""samples.jsonl says of every response what happened to it, and the tables show it without harm."""
+"""samples.jsonl records the outcome of every response, and the tables show it safely."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def rows():
     return sample_rows(TOKENIZER, prompts, experience, scores, batch, valid, 24)
 
 
-def test_a_row_says_what_happened_to_its_response():
+def test_a_row_records_the_outcome_of_its_response():
     first, second, third = rows()
     assert first == {
         "step": 24,

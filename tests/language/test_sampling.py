@@ -1,6 +1,4 @@
-"""Sampling: the distribution that is promised, rows that do not disturb each other, padding that is
-nothing.
-"""
+"""Sampling: the right distribution, independent rows, padding without effect."""
 
 import pytest
 import torch
@@ -29,7 +27,7 @@ def uniforms(rows, columns, seed=0):
     return torch.rand(rows, columns, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_positions_count_real_tokens_alone():
+def test_positions_count_only_real_tokens():
     real = torch.tensor([[False, False, True, True, True, False]])
     assert positions(real).tolist() == [[0, 0, 0, 1, 2, 2]]
 
@@ -40,7 +38,7 @@ def test_positions_count_real_tokens_alone():
     "settings", [Sampling(), Sampling(0.7), Sampling(1.0, top_k=5), Sampling(forbidden=EOS)]
 )
 def test_log_probabilities_of_sampling_are_those_of_training(make, samples, settings):
-    """With a KV cache, finished rows dropped, prompts shared: the plain forward pass says the same."""
+    """With a KV cache, finished rows dropped, prompts shared: the same as the plain forward pass."""
     model = make()
     tokens, real = prompts()
     got = sample(model, tokens, real, settings, uniforms(5 * samples, 12), EOS, samples_per_prompt=samples)
@@ -103,7 +101,7 @@ def test_a_response_ends_with_its_eos_and_nothing_behind_it_counts():
 
 
 def test_an_eos_in_the_last_place_that_there_is_ends_the_response():
-    """The longest response of a batch is not a cut one."""
+    """The longest response of a batch does not count as cut."""
     model = tiny_llama()
     tokens, real = prompts(rows=40)
     numbers = uniforms(40, 30, seed=1)
@@ -116,7 +114,7 @@ def test_an_eos_in_the_last_place_that_there_is_ends_the_response():
 
 
 def test_frequencies_are_the_probabilities():
-    """Inverse transform of evenly spaced uniforms: each token as often as its probability says, to one
+    """Inverse transform of evenly spaced uniforms: each token in proportion to its probability, to one
     draw.
     """
     torch.manual_seed(0)
@@ -143,7 +141,7 @@ def test_frequencies_are_the_probabilities():
 
 @pytest.mark.parametrize("make", MODELS)
 def test_a_model_is_loaded_without_dropout(make, tmp_path):
-    """Whoever calls train() later: GPT-2 has dropout 0.1 in its config, and Llama is given some."""
+    """Even after a later train(): GPT-2 has dropout 0.1 in its config, and Llama gets some."""
     model = make()
     model.config.attention_dropout = 0.5
     base = load_causal(saved(tmp_path, model)).train()

@@ -1,4 +1,4 @@
-"""Who judges: functions and a reward model together; no column is lost and no score is made up."""
+"""Functions and a reward model judge together; no column is lost and no score is made up."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ ASKED = [prompt for prompt in PROMPTS for _ in range(2)]
 
 @pytest.fixture(scope="module")
 def sampled(tmp_path_factory):
-    """Roles and the six responses that they sampled."""
+    """Roles and their six sampled responses."""
     return experienced(settings(saved(tmp_path_factory.mktemp("model"))))
 
 
@@ -60,7 +60,7 @@ def test_every_kind_of_reward_takes_a_weight(sampled):
     assert scores.parts["reward_model_2"].tolist() == [0, 1, 2, 3, 4, 5]  # a column is before its weight
 
 
-def test_a_score_of_the_model_that_is_not_finite_masks_its_response_and_says_so(sampled):
+def test_a_model_score_that_is_not_finite_masks_its_response_and_is_reported(sampled):
     roles, experience = sampled
     for functions, constant in ((None, 0.0), (Rewards([reward_model]), 1.0)):
         model = model_of(1.0, float("nan"), 3.0, float("inf"), 5.0, 6.0)
@@ -75,7 +75,7 @@ def test_a_score_of_the_model_that_is_not_finite_masks_its_response_and_says_so(
         Judge(roles, None, model_of(*[float("nan")] * 6))(ASKED, experience)
 
 
-def test_where_no_function_applies_the_model_stands_alone(sampled):
+def test_where_no_function_applies_only_the_model_judges(sampled):
     """Also batch after batch: nothing is wrong then."""
     roles, experience = sampled
     rare = lambda completions: [None, 1.0, None, float("nan"), None, None]  # noqa: E731
@@ -88,7 +88,7 @@ def test_where_no_function_applies_the_model_stands_alone(sampled):
 
 
 def test_functions_and_models_judge_the_very_tokens_that_were_sampled(sampled):
-    """Text that is decoded and read again may have other tokens: here some ids have no word at all."""
+    """Decoded text may give other tokens when encoded again: here some ids have no word at all."""
     roles, experience = sampled
     seen = {}
 
@@ -108,7 +108,7 @@ def test_functions_and_models_judge_the_very_tokens_that_were_sampled(sampled):
 
 
 def reward_folder(path: Path, **changes) -> str:
-    """A reward model of somebody else's, over the tiny tokenizer."""
+    """Somebody else's reward model, with the tiny tokenizer."""
     from transformers import LlamaForSequenceClassification
 
     config = tiny_llama(layers=1).config
@@ -138,7 +138,7 @@ def test_what_cannot_judge_is_named(sampled, tmp_path):
     assert config["architectures"] == ["LlamaForSequenceClassification"]
 
 
-def test_an_adapter_shares_the_trunk_of_its_own_weights_wherever_they_lie(tmp_path):
+def test_an_adapter_shares_a_trunk_with_the_same_weights_wherever_they_are_stored(tmp_path):
     first = tmp_path / "model"
     saved(first, tiny_llama(2))
     given = RewardSettings(model=str(first), minibatch_size=4, max_tokens=16, held_out=0.0)

@@ -14,7 +14,7 @@ def folder(tmp_path_factory):
 
 
 def bad(folder: str, dtype: str = "float32") -> list[str]:
-    """What the doctor finds wrong."""
+    """The problems that the doctor finds."""
     return [finding.what for finding in selfcheck.check_model(folder, dtype) if not finding.good]
 
 
@@ -25,7 +25,7 @@ def test_a_healthy_model_is_healthy_in_every_precision(folder, dtype):
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_a_model_that_attends_to_padding_on_the_left_is_found(folder, dtype, monkeypatch):
-    """It is right where rows are padded on the right: no other check compares the two sides."""
+    """It is correct for rows padded on the right: no other check compares the two sides."""
     real = trunk._run
 
     def careless(base, mask, **inputs):
@@ -37,7 +37,7 @@ def test_a_model_that_attends_to_padding_on_the_left_is_found(folder, dtype, mon
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_a_policy_that_trains_at_another_temperature_is_found_in_every_precision(folder, dtype, monkeypatch):
-    """Hidden states of the training pass are 1.5 times too large: sampling and training are two policies."""
+    """Hidden states of the training pass are 1.5 times too large: sampling and training use two policies."""
     real, calls = trunk.Role.hidden, []
 
     def warmer(self, *given):

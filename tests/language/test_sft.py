@@ -1,4 +1,4 @@
-"""Supervised fine-tuning: the loss is the text's own, packing and padding are nothing, and it learns."""
+"""Supervised fine-tuning: the correct loss, packing and padding without effect, and it learns."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def rows_of(examples):
 
 
 @pytest.mark.parametrize("make", MODELS)
-def test_packed_examples_have_the_logits_they_have_alone(make):
+def test_packed_examples_have_the_same_logits_as_separate_ones(make):
     model, examples = make(), random_examples(12, 20)
     packed = pack_rows(examples, 40)
     assert len(packed) < len(examples)
@@ -63,12 +63,12 @@ def test_packed_examples_have_the_logits_they_have_alone(make):
             worst = max(worst, float((together[row][inside] - wanted).abs().max()))
             worst_leaking = max(worst_leaking, float((leaking[row][inside] - wanted).abs().max()))
     assert worst < 1e-5
-    assert worst_leaking > 0.1  # without the blocks, texts do see each other: the test can fail
+    assert worst_leaking > 0.1  # without the blocks, texts see each other: the test can fail
 
 
 @pytest.mark.parametrize("make", MODELS)
 @pytest.mark.parametrize("filler", [0, 3, 40])
-def test_loss_and_gradient_are_those_of_each_text_alone(make, filler):
+def test_loss_and_gradient_equal_those_of_separate_texts(make, filler):
     """Against transformers' own loss on one unpadded text at a time; the prompt's tokens do not count."""
     model, examples = make(), random_examples(6, 15)
     examples = [
@@ -182,7 +182,7 @@ def folder(tmp_path_factory) -> str:
 @pytest.mark.parametrize("tune", ["full", "lora"])
 @pytest.mark.parametrize("make", MODELS)
 def test_it_learns_facts_and_where_they_end(tmp_path, make, tune):
-    """Also where the model has no PAD (GPT-2): after a fact it says EOS. The folder loads elsewhere."""
+    """Also for a model without PAD (GPT-2): after a fact it emits EOS. The folder loads elsewhere."""
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
     source, events = saved(tmp_path / "base", make()), []
@@ -206,7 +206,7 @@ def test_it_learns_facts_and_where_they_end(tmp_path, make, tune):
     assert [type(event) for event in events] == [Message, Started, *[Updated] * 80, Finished]
 
 
-def test_lora_leaves_the_trunk_alone_and_the_merged_model_is_the_adapted_one(tmp_path, folder):
+def test_lora_does_not_change_the_trunk_and_the_merged_model_equals_the_adapted_one(tmp_path, folder):
     model, made = load_causal(folder), load_tokenizer(folder)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     settings = settings_of(folder, tune="lora", lora_layers=2, lora_rank=4)
@@ -259,12 +259,12 @@ def test_of_several_eos_the_tokenizers_own_closes_a_text():
 
 def test_same_seed_same_bits_other_seed_others(tmp_path, folder):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        torch.manual_seed(hash(name) % 1000)  # the global generator has no say
+        torch.manual_seed(hash(name) % 1000)  # the global generator has no effect
         train_sft(settings_of(folder, seed=seed, held_out=0.2), data=FACTS, run_dir=tmp_path / name)
     assert weights(tmp_path / "a") == weights(tmp_path / "b") != weights(tmp_path / "c")
 
 
-def test_the_run_folder_tells_what_happened(tmp_path, folder):
+def test_the_run_folder_records_what_happened(tmp_path, folder):
     data = tmp_path / "facts.jsonl"
     data.write_text("".join(json.dumps({"text": fact}) + "\n" for fact in FACTS))
     settings = settings_of(folder, data=str(data), held_out=0.25, num_epochs=2, max_examples=7, tune="full")
@@ -342,7 +342,7 @@ def test_threads_are_the_users_again_afterwards(tmp_path, folder):
         ({"device": "nowhere"}, FACTS, "device is 'nowhere', which cannot be used here .* Choose cpu"),
     ],
 )
-def test_what_cannot_work_is_said_before_anything_is_written(tmp_path, folder, values, data, message):
+def test_invalid_settings_are_reported_before_anything_is_written(tmp_path, folder, values, data, message):
     with pytest.raises(ValueError, match=message):
         train_sft(settings_of(folder, **values), data=data, run_dir=tmp_path / "run")
     assert not (tmp_path / "run").exists()

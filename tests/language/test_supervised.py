@@ -1,4 +1,4 @@
-"""Runs of stages one and two around their loop: their memory is told first, and they can be gone on with."""
+"""Runs of stages one and two: they print their memory needs first, and they can be resumed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def folder(tmp_path_factory) -> str:
 
 
 class Cut(Exception):
-    """What stops a run."""
+    """Stops a run."""
 
 
 def stopping(step: int):
@@ -53,13 +53,13 @@ def stopping(step: int):
 
 
 def rows_of(run_dir) -> list[dict]:
-    """The metrics without what a clock gave."""
+    """The metrics without clock times."""
     rows = Run.open(run_dir).read_metrics()
     return [{k: v for k, v in row.items() if k != "seconds" and not k.startswith("time/")} for row in rows]
 
 
 def same_end(a, b) -> bool:
-    """Whether two runs leave the same bits: the models, and every tensor of their last checkpoints."""
+    """Whether two runs end with the same bits: the models, and every tensor of their last checkpoints."""
     names = [path.relative_to(a) for path in a.rglob("*.safetensors") if "checkpoints" not in path.parts]
     assert names and all((a / name).read_bytes() == (b / name).read_bytes() for name in names)
     (first, state), (second, other) = (Run.open(run).newest()[1:] for run in (a, b))
@@ -74,13 +74,13 @@ def same_end(a, b) -> bool:
 @BOTH
 @pytest.mark.parametrize("tune", ["lora", "full"])
 @pytest.mark.parametrize("stop", [2, 8, 11])
-def test_a_run_that_goes_on_ends_where_one_without_a_break_does(tmp_path, folder, stage, tune, stop):
-    """To the last bit, in the middle of an epoch (8), after one (11), and before the first checkpoint (2)."""
+def test_a_resumed_run_ends_like_an_uninterrupted_one(tmp_path, folder, stage, tune, stop):
+    """Bit for bit, in the middle of an epoch (8), after one (11), and before the first checkpoint (2)."""
     train, resume, kind, data = STAGES[stage]
     settings = kind(model=folder, tune=tune, held_out=0.25, checkpoint_every=0.45, **FAST)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     summary = train(settings, data=data, run_dir=whole)
-    assert len(rows_of(whole)) == 10  # 3 minibatches of 6 examples, thrice, and what stands before
+    assert len(rows_of(whole)) == 10  # 3 minibatches of 6 examples, three times, and the rows before
     with pytest.raises(Cut):
         train(settings, data=data, run_dir=broken, listeners=[stopping(min(stop, 9))])
     events = []
@@ -104,7 +104,7 @@ def test_saves_lie_on_a_grid_of_the_run_and_at_its_end(tmp_path, folder):
         assert sorted(map(step_of, (run / "checkpoints").iterdir())) == wanted
 
 
-def test_each_epoch_has_an_order_of_its_own_which_the_seed_alone_decides():
+def test_each_epoch_has_its_own_order_which_depends_only_on_the_seed():
     def orders(epochs: int, seed: int = 0) -> list[list[int]]:
         settings = SFTSettings(num_epochs=epochs, minibatch_size=3, seed=seed)
         flat = [item for part in minibatches(range(10), settings) for item in part]
@@ -191,7 +191,7 @@ def test_the_command_finds_the_kind_of_run(tmp_path, folder, stage, capsys):
         assert f"run of {stage}, which has no {option}" in capsys.readouterr().err
 
 
-def test_ctrl_c_says_what_to_type(tmp_path, folder, capsys, monkeypatch):
+def test_ctrl_c_prints_the_command(tmp_path, folder, capsys, monkeypatch):
     data, run = tmp_path / "facts.txt", str(tmp_path / "run")
     data.write_text("\n".join(FACTS))
 
@@ -210,7 +210,9 @@ def test_ctrl_c_says_what_to_type(tmp_path, folder, capsys, monkeypatch):
 
 
 @BOTH
-def test_memory_is_told_first_and_a_job_that_cannot_fit_loads_nothing(tmp_path, folder, stage, monkeypatch):
+def test_memory_is_printed_first_and_a_job_that_cannot_fit_loads_nothing(
+    tmp_path, folder, stage, monkeypatch
+):
     train, _, kind, data = STAGES[stage]
     settings, events = kind(model=folder, tune="full", **FAST), []
     train(settings, data=data, run_dir=tmp_path / "run", listeners=[lambda event: events.append(event)])

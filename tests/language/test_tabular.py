@@ -21,8 +21,8 @@ SETTINGS = PPOSettings(
 )  # fmt: skip
 
 
-# The score of a first and a second word; nothing follows the EOS 0. What word 1 promises lies far from the
-# reference: to collect it costs a KL that is paid one step later.
+# The score of a first and a second word; nothing follows the EOS 0. The high scores after word 1 are far from
+# the reference: collecting them costs a KL one step later.
 SCORES = torch.tensor(
     [[0.0, 0.0, 0.0, 0.0], [-1.0, -1.0, -1.0, 1.5], [0.5, 0.5, 0.5, 0.5], [0.3, 0.6, 0.0, 0.9]],
     dtype=torch.float64,
@@ -74,7 +74,7 @@ def optimum(reference: Tabular) -> Tensor:
 
 
 def blind_optimum(reference: Tabular) -> Tensor:
-    """Probabilities [N] at which a state's own KL balances the scores, later states' KL left out.
+    """Probabilities [N] at which a state's own KL balances the scores, without the KL of later states.
 
     In every state p(a|s) is proportional to p_ref(a|s) exp(E[score | s, a] / KL_BETA).
     """
@@ -91,7 +91,7 @@ def blind_optimum(reference: Tabular) -> Tensor:
     [("k1-reward", False, 0.001), ("exact-split", False, 0.02), ("exact-split", True, 0.02)],
 )
 def test_the_known_optimum_is_reached(form: str, normalise: bool, limit: float) -> None:
-    """k1-reward comes nearest: at the optimum all responses have one return, and no noise is left."""
+    """k1-reward comes nearest: at the optimum all responses have the same return, without noise."""
     policy, reference = train(form, normalise=normalise)
     best = optimum(reference)
     assert total_variation(reference.probabilities(), best) > 0.2, "the task would be no task"

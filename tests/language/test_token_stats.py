@@ -18,7 +18,7 @@ def numbers(bias: bool, dtype=torch.float64):
 
 
 def plainly(head, hidden, reference, tokens, sampling, support):
-    """The same by whole matrices and autograd."""
+    """The same with whole matrices and autograd."""
     logits, theirs = (head(x).double() / sampling.temperature for x in (hidden, reference))
     allowed = torch.ones(N, V, dtype=torch.bool)
     allowed[:, list(sampling.forbidden)] = False
@@ -52,14 +52,14 @@ def test_values_and_gradients(monkeypatch, bias, chunk, sampling, top):
     sum((w * x).sum() for w, x in zip(weights, wanted, strict=True)).backward()
     for a, b in zip(found[:3], wanted, strict=True):
         torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=1e-5)
-    # the reference shares the head: its own gradient there is not asked for
+    # the reference shares the head: its own gradient there is not needed
     torch.testing.assert_close(got[0], hidden.grad, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("sampling", [Sampling(), Sampling(0.7, forbidden=(0, 1))])
 @pytest.mark.parametrize("top", [0, 5])
 def test_the_entropy_is_that_of_the_maths(monkeypatch, sampling, top):
-    """Value and gradient, chunked, in the very logits that the sampler shapes."""
+    """Value and gradient, chunked, for the same logits that the sampler uses."""
     monkeypatch.setattr(distribution, "CHUNK", 3 * V)
     head, hidden, _, tokens = numbers(True, torch.float32)
     support = None

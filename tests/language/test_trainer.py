@@ -1,4 +1,4 @@
-"""The loop of an alignment run: every part gets what is meant for it, nothing twice and nothing stale."""
+"""The loop of an alignment run: every part gets its own data, nothing twice and nothing stale."""
 
 import math
 import time
@@ -28,7 +28,7 @@ PROMPTS = ["ab", "cde", "f", "ghij"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A model with many stops: responses of all lengths."""
+    """A model that stops often, with responses of all lengths."""
     model = tiny_llama()
     model.generation_config.eos_token_id = [*range(3, 12)]
     return saved(tmp_path_factory.mktemp("model"), model)
@@ -61,7 +61,7 @@ def shaken(made):
 
 @pytest.mark.parametrize("form", KL_FORMS)
 def test_where_nothing_is_to_be_earned_the_kl_leads_back_to_the_reference(folder, form):
-    """The sign of the KL where it acts: turned round, the policy would flee."""
+    """The sign of the KL: with the wrong sign the policy would move away from the reference."""
     made = shaken(
         trainer(folder, nothing, kl=form, kl_beta=1.0, total_episodes=320, batch_size=64, learning_rate=3e-3)
     )
@@ -70,7 +70,7 @@ def test_where_nothing_is_to_be_earned_the_kl_leads_back_to_the_reference(folder
 
 
 def test_kl_beta_follows_the_kl_of_whole_responses_once_a_rollout(folder):
-    """The goal lies beside the KL, so that the error is not clipped and its size tells what was fed."""
+    """The goal is close to the KL, so that the error is not clipped and its size reveals the input."""
     still = {"total_episodes": 64, "learning_rate": 1e-6, "kl_beta": 0.2, "kl_horizon": 100.0}
     first = next(shaken(trainer(folder, **still)).iterate()).metrics
     goal = 0.95 * first["objective/kl"]
@@ -104,7 +104,7 @@ def test_micro_batches_change_no_metric(folder, form):
 
 
 def test_the_pass_that_the_rollout_keeps_changes_no_metric(folder, monkeypatch):
-    """Batches of one pass: three iterations, with the rollout's pass as the first one and without."""
+    """Batches of one pass: three iterations, with and without the rollout's pass as the first one."""
     values = {"minibatch_size": 16, "num_epochs": 2, "total_episodes": 48, "critic_warmup": 1}
     taken, found = [], []
     init = PolicyModel.__init__
@@ -116,7 +116,7 @@ def test_the_pass_that_the_rollout_keeps_changes_no_metric(folder, monkeypatch):
         made = shaken(trainer(folder, micro_batch_size=micro, **values))
         rows = [update.metrics for update in made.iterate()]
         found.append([{name: x for name, x in row.items() if name[:5] != "time/"} for row in rows])
-    assert taken == [False, True, True, False, False, False]  # never while the critic alone warms up
+    assert taken == [False, True, True, False, False, False]  # never while only the critic warms up
     for kept, own in zip(*found, strict=True):
         assert kept == pytest.approx(own, rel=1e-2, abs=1e-3)
 
@@ -268,8 +268,8 @@ def test_held_out_prompts_are_answered_as_many_at_a_time_as_a_batch_has(folder, 
     assert sizes == [4, 4, 2] and len(made.held_out) == 10 and 0 <= found["eval/gold"] <= 1
 
 
-def test_what_the_gold_judge_fails_to_score_is_told_and_counted(folder):
-    """Not in silence: the mean is that of a part of the responses."""
+def test_responses_without_a_gold_score_are_reported_and_counted(folder):
+    """With a message, because the mean covers only some of the responses."""
     lines, prompts = [], [chr(97 + k % 26) * (1 + k // 26) for k in range(40)]
     settings = AlignSettings(model=folder, batch_size=8, max_new_tokens=3, held_out_prompts=8)
 
@@ -288,7 +288,7 @@ def test_what_the_gold_judge_fails_to_score_is_told_and_counted(folder):
             made.gold_scores()
 
 
-def test_a_run_without_one_step_says_so(folder, tmp_path):
+def test_a_run_without_one_step_reports_it(folder, tmp_path):
     lines = []
     run = align(
         model=folder, prompts=["ab", "cd"], reward=lambda completions, **_: [None] * len(completions),
@@ -312,8 +312,8 @@ def test_memory_that_is_short_for_scoring_names_the_setting(folder, monkeypatch)
         next(made.iterate())
 
 
-def test_memory_that_is_short_for_a_kept_pass_is_told_once(folder, monkeypatch):
-    """From then on no pass is kept: the size says so, and lies in the checkpoint."""
+def test_too_little_memory_for_a_kept_pass_is_reported_once(folder, monkeypatch):
+    """From then on no pass is kept: the checkpoint stores the micro-batch size, which implies it."""
     from tightrope.language.alignment import experience as collect
 
     lines, looks, whole = [], [], collect._evaluate

@@ -1,4 +1,4 @@
-"""A trunk in two halves is the trunk, and padding is nothing to it."""
+"""A trunk in two halves equals the whole trunk, and padding has no effect."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ def test_the_halves_agree_with_the_whole_and_pass_gradients(make, cut):
 
 @pytest.mark.parametrize("make", MODELS)
 def test_a_cut_that_does_not_agree_is_not_made(make, monkeypatch):
-    """An architecture that scales what enters its layers would be wrong in halves: it stays in one piece."""
+    """An architecture that scales the input of its layers would be wrong in halves: it stays whole."""
     model = make()
     base = model.base_model
     forward = type(base).forward

@@ -1,4 +1,4 @@
-"""Tiny random models and a tokenizer, made in memory: what every test of the language story stands on."""
+"""Tiny random models and a tokenizer, made in memory, for all language tests."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def tiny_gpt2(layers: int = 3, seed: int = 0) -> Any:
 
 
 def tokenizer(chat: bool = False) -> Any:
-    """Characters; EOS and PAD are tokens of their own."""
+    """Characters; EOS and PAD are separate tokens."""
     from tokenizers import Regex, Tokenizer, decoders, models, pre_tokenizers
     from transformers import PreTrainedTokenizerFast
 
@@ -61,7 +61,7 @@ def tokenizer(chat: bool = False) -> Any:
 
 
 def saved(folder: Path, model: Any = None, chat: bool = False) -> str:
-    """A model folder as transformers writes it."""
+    """A model folder in the format of transformers."""
     (tiny_llama() if model is None else model).save_pretrained(folder)
     tokenizer(chat).save_pretrained(folder)
     return str(folder)

@@ -1,4 +1,4 @@
-"""Probe environments: each can only be solved by one part of the algorithm working."""
+"""Probe environments: each is solvable only if one part of the algorithm works."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 
 class Probe(gym.Env):
-    """One observation column; subclasses say what is seen and paid."""
+    """One observation column; subclasses define the observation and the reward."""
 
     observation_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
     action_space = spaces.Discrete(2)
@@ -36,11 +36,11 @@ class Probe(gym.Env):
 
 
 class ValueProbe(Probe):
-    """Reward 1 whatever happens: V = 1. Isolates the value loss."""
+    """Always reward 1: V = 1. Isolates the value loss."""
 
 
 class ValueByObservation(Probe):
-    """Reward equals what is seen, -1 or 1: V(s) = s. Isolates the critic's inputs."""
+    """The reward equals the observation, -1 or 1: V(s) = s. Isolates the critic's inputs."""
 
     def draw(self):
         return float(self.np_random.choice([-1.0, 1.0]))
@@ -69,7 +69,7 @@ class PolicyProbe(Probe):
 
 
 class ConditionProbe(ValueByObservation):
-    """The action that matches the sign of what is seen pays 1. Isolates conditioning on the observation."""
+    """The action that matches the sign of the observation pays 1. Isolates conditioning on it."""
 
     def pay(self, action):
         return 1.0 if (action == 1) == (self.seen > 0) else -1.0
@@ -108,7 +108,7 @@ class Identity(gym.Env):
 
 
 def closeness(space, a, b):
-    """1 for the same, less for less alike, in [0, 1]; means over the parts of a space."""
+    """Similarity in [0, 1], 1 for equal values; means over the parts of a space."""
     if isinstance(space, spaces.Dict):
         return float(np.mean([closeness(s, a[k], b[k]) for k, s in space.spaces.items()]))
     if isinstance(space, spaces.Tuple):

@@ -1,4 +1,4 @@
-"""The newcomer's first run: each algorithm solves CartPole with its preset, in seconds."""
+"""A new user's first run: each algorithm solves CartPole with its preset, in seconds."""
 
 import json
 

@@ -80,7 +80,7 @@ def test_reinforce_without_baseline_learns_too():
 def test_a_time_limit_is_not_death(backend, engine):
     """Reward 1 for ever under a limit of 8 steps: V = 1 / (1 - 0.95) = 20 within 2 %.
 
-    Were truncation taken for death, V could not exceed 8.
+    If truncation were treated as termination, V could not exceed 8.
     """
     values = {**FAST, **PLAIN, "learning_rate": 1e-2, "num_epochs": 10, "gamma": 0.95, "seed": 1}
     values |= {"vector_backend": backend, "num_workers": 2, "engine": engine}
@@ -103,7 +103,7 @@ SPACES = {
 
 @pytest.mark.parametrize("name", SPACES)
 def test_identity_in_every_space(name):
-    """Answer with what is seen: at least 85 % of the pay after 24,000 steps."""
+    """Answer with the observation: at least 85 % of the reward after 24,000 steps."""
     agent = tightrope.PPO(
         lambda: Identity(SPACES[name]), seed=2, gamma=0.5, **{**FAST, **PLAIN}, log_std_init=-0.5
     )

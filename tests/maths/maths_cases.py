@@ -1,4 +1,4 @@
-"""Random rollouts to try a property on, the hypothesis strategy that draws them, and exact comparison."""
+"""Random rollouts for testing properties, the hypothesis strategy that draws them, and exact comparison."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-# Fixed draws: a failure is the same tomorrow and on another machine.
+# Fixed draws: a failure repeats tomorrow and on another machine.
 PROPERTY = settings(deadline=None, max_examples=50, derandomize=True, database=None)
 
 
@@ -86,7 +86,7 @@ CASES = st.builds(
     gae_lambda=st.sampled_from([0.0, 0.3, 0.95, 1.0]),
     counting=st.sampled_from([0.3, 0.8, 1.0]),
 )
-# A few rollouts that stand for all where hypothesis would take too long: once for every mutant.
+# A few representative rollouts for the mutants, where hypothesis would take too long.
 FIXED_CASES = (
     random_case(0),
     random_case(1, rows=4, steps=9, gamma=0.5, gae_lambda=0.95, counting=0.5),
@@ -100,7 +100,7 @@ same = partial(torch.testing.assert_close, rtol=0, atol=0)
 
 
 def with_gradients(function: Callable[..., Tensor], *inputs: Tensor) -> list[Tensor]:
-    """The output, and the gradient of the sum of its sine (no symmetry to hide in) by every input."""
+    """The output, and the gradient of the sum of its sine (which has no symmetry) for every input."""
     leaves = [tensor.detach().clone().requires_grad_() for tensor in inputs]
     output = function(*leaves)
     gradients = torch.autograd.grad(output.sin().sum(), leaves, allow_unused=True)

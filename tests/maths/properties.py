@@ -1,8 +1,8 @@
-"""What the mathematics must fulfil, each property a function of (maths, case) that raises AssertionError.
+"""Properties of the mathematics: each is a function of (maths, case) that raises AssertionError.
 
-`maths` is the package, handed in, so that the same checks judge the real one (test_properties.py) and its
-mutants (test_mutants.py). The references are written another way than the code under test: loops over Python
-numbers, sums over all actions, numpy, torch.distributions.
+`maths` is the package, passed in so that the same checks test the real one (test_properties.py) and its
+mutants (test_mutants.py). The references do not share the method of the code under test: they use loops over
+Python numbers, sums over all actions, numpy, torch.distributions.
 """
 
 from collections.abc import Callable

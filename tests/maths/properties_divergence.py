@@ -1,4 +1,4 @@
-"""What entropies and divergences must fulfil: functions of (maths, case), see properties.py."""
+"""Properties of entropies and divergences: functions of (maths, case), see properties.py."""
 
 from types import ModuleType
 
@@ -26,7 +26,7 @@ def the_estimators_are_the_kl_on_average(maths: ModuleType, c: Case) -> None:
 
 
 def the_gradient_of_k3_is_that_of_the_kl(maths: ModuleType, c: Case) -> None:
-    """Through the KL-penalised surrogate with advantages 0, as it is trained."""
+    """As in training: through the KL-penalised surrogate, with advantages 0."""
     old, new = parameters(c, 2)
     probabilities = old.softmax(-1)
 
@@ -61,7 +61,7 @@ def entropies_agree_with_torch(maths: ModuleType, c: Case) -> None:
 
 
 def masked_choices_do_not_exist(maths: ModuleType, c: Case) -> None:
-    """A logit of -inf gives what leaving the choice out gives, and its own gradient is 0."""
+    """A logit of -inf is equivalent to removing the choice, and its own gradient is 0."""
     (p,) = parameters(c, 1)
     free = torch.tensor([True, False, True, True, False])
     hidden = torch.where(free, p, IMPOSSIBLE)

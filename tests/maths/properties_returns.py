@@ -1,4 +1,4 @@
-"""What returns and advantages must fulfil: functions of (maths, case), see properties.py."""
+"""Properties of returns and advantages: functions of (maths, case), see properties.py."""
 
 import math
 from types import ModuleType
@@ -87,7 +87,7 @@ def without_bootstrap_the_future_is_0(maths: ModuleType, c: Case) -> None:
 
 
 def episodes_know_nothing_of_each_other(maths: ModuleType, c: Case) -> None:
-    """Cut a row where it has ended: each part alone gives what it gave together."""
+    """Cut a row where it has ended: each part gives the same result as in the whole row."""
     whole = gae_of(maths, c)
     returns = maths.returns.discounted_returns(c.rewards, c.ended, c.gamma, c.final_values)
     for row, t in c.ended.nonzero().tolist():
@@ -121,7 +121,7 @@ def rows_may_be_permuted_and_padded(maths: ModuleType, c: Case) -> None:
 
 
 def nan_behind_a_cut_changes_nothing(maths: ModuleType, c: Case) -> None:
-    """Neither a value nor a gradient, of GAE and of the returns."""
+    """Neither values nor gradients change, for GAE and the returns."""
 
     def gae(rewards: Tensor, values: Tensor, following: Tensor) -> Tensor:
         return maths.returns.gae(

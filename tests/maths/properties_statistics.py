@@ -1,4 +1,4 @@
-"""What the statistics and the critic's losses must fulfil: functions of (maths, case), see properties.py."""
+"""Properties of the statistics and the critic's losses: functions of (maths, case), see properties.py."""
 
 import math
 from functools import partial
@@ -25,7 +25,7 @@ def masked_statistics_are_numpy_on_what_counts(maths: ModuleType, c: Case) -> No
 
 
 def micro_batches_add_up_to_the_batch(maths: ModuleType, c: Case) -> None:
-    """Any split of the rows, also into parts where nothing counts: the same mean and the same gradient."""
+    """Any split of the rows, even with parts where nothing counts: the same mean and the same gradient."""
     whole = with_gradients(partial(maths.statistics.masked_mean, mask=c.mask), c.rewards)
     cut = int(torch.randint(len(c.rewards) + 1, (), generator=c.generator))
     empty = torch.zeros_like(c.mask)
@@ -60,7 +60,7 @@ def equal_steps_standardise_to_0(maths: ModuleType, c: Case) -> None:
 
 
 def running_moments_are_those_of_all_rows(maths: ModuleType, c: Case) -> None:
-    """In three batches, empty ones too, and far from 0, where a naive sum of squares loses all digits."""
+    """In three batches, some empty, far from 0, where a naive sum of squares loses all digits."""
     rows = c.rewards.numpy() * [1.0, 1e-3][c.seed % 2] + 1e4
     width = rows.shape[1]
     moments = maths.statistics.RunningMoments.empty(width)

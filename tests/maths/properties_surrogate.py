@@ -1,4 +1,4 @@
-"""What the surrogate losses must fulfil: functions of (maths, case), see properties.py."""
+"""Properties of the surrogate losses: functions of (maths, case), see properties.py."""
 
 import math
 from functools import partial
@@ -28,7 +28,7 @@ def clipped_surrogate_is_its_equation(maths: ModuleType, c: Case) -> None:
 
 
 def the_clip_has_four_cases(maths: ModuleType, c: Case) -> None:
-    """The gradient by the ratio is 0 exactly where the step has gone far enough, and -A elsewhere."""
+    """The gradient by the ratio is 0 exactly where the step has moved far enough, and -A elsewhere."""
     for low, high, dual in CLIPS:
         log_ratio = c.log_ratio.clone().requires_grad_()
         maths.surrogate.clipped_surrogate(log_ratio, c.advantages, low, high, dual).sum().backward()
@@ -79,7 +79,7 @@ def at_ratio_1_ppo_is_the_policy_gradient(maths: ModuleType, c: Case) -> None:
 
 
 def masked_log_ratios_are_0(maths: ModuleType, c: Case) -> None:
-    """NaN in the padding, and a NaN advantage there later on, reach no gradient."""
+    """NaN in the padding, or a NaN advantage there, reaches no gradient."""
     advantages = poisoned(c.advantages, ~c.mask)
 
     def loss(logp: Tensor, old_logp: Tensor, advantages: Tensor) -> Tensor:

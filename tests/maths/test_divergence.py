@@ -1,4 +1,4 @@
-"""Entropies and divergences: numbers worked by hand, extremes and derivatives."""
+"""Entropies and divergences: numbers computed by hand, extremes and derivatives."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""No rows and no steps: what is per step stays empty, what is a scalar is 0, and nothing crashes."""
+"""No rows and no steps: per-step results stay empty, scalars are 0, and nothing crashes."""
 
 import pytest
 import torch

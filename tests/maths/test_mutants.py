@@ -1,4 +1,4 @@
-"""Do the properties notice a mistake? Each mutant is the package with one classic mistake seeded."""
+"""Do the properties detect mistakes? Each mutant is the package with one classic mistake seeded."""
 
 import importlib
 import shutil
@@ -229,7 +229,7 @@ MUTANTS = (
 
 @pytest.fixture
 def load(tmp_path: Path) -> Iterator[Callable[[Mutant | None], ModuleType]]:
-    """Copies the package, seeds the mistake and imports the copy under a name of its own."""
+    """Copies the package, seeds the mistake and imports the copy under its own name."""
     name = "mutated_maths"
 
     def copy_and_import(mutant: Mutant | None) -> ModuleType:
@@ -251,7 +251,7 @@ def load(tmp_path: Path) -> Iterator[Callable[[Mutant | None], ModuleType]]:
         del sys.modules[module]
 
 
-def test_the_package_as_it_stands_passes(load: Callable[[Mutant | None], ModuleType]) -> None:
+def test_the_current_package_passes(load: Callable[[Mutant | None], ModuleType]) -> None:
     copy = load(None)
     assert copy is not tightrope.maths
     check_all(copy)

@@ -1,4 +1,4 @@
-"""In float32 every function keeps the dtype and stays within rounding of its float64 answer."""
+"""In float32 every function keeps the dtype and stays within rounding of its float64 result."""
 
 from collections.abc import Callable
 

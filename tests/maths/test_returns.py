@@ -1,4 +1,4 @@
-"""Returns and advantages: numbers worked by hand, derivatives and bad shapes."""
+"""Returns and advantages: numbers computed by hand, derivatives and bad shapes."""
 
 import pytest
 import torch
@@ -74,7 +74,7 @@ def test_gradients_agree_with_finite_differences() -> None:
 
 
 def test_broadcasting_is_refused() -> None:
-    """Rewards [T] beside values [1, T] would compute, and in most shapes compute nonsense."""
+    """Rewards [T] with values [1, T] would broadcast, and mostly give nonsense."""
     with pytest.raises(ValueError, match=r"shapes differ: rewards \(3,\), values \(1, 3\)"):
         td_errors(REWARDS[0], VALUES, FOLLOWING, NEVER, 0.5)
     with pytest.raises(ValueError, match=r"ended \(3, 1\)"):

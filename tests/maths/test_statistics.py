@@ -1,4 +1,4 @@
-"""Masked statistics and running moments: numbers worked by hand and the edges of their definitions."""
+"""Masked statistics and running moments: numbers computed by hand and edge cases."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Surrogate losses: the cases of the clip and other numbers worked by hand, derivatives and bad input."""
+"""Surrogate losses: the cases of the clip and other numbers computed by hand, derivatives and bad input."""
 
 import math
 
@@ -55,7 +55,7 @@ def test_the_upper_side_may_differ() -> None:
 
 
 def test_case_4_without_dual_clip_is_not_silently_bounded() -> None:
-    """exp(1000) is infinite, and an infinite loss is seen; a quiet 0 gradient would not be."""
+    """exp(1000) is infinite. An infinite loss is noticed; a silent 0 gradient would not be."""
     loss = clipped_surrogate(torch.tensor([[1000.0]]), torch.tensor([[-1.0]]), 0.2)
     assert loss.item() == math.inf
 

@@ -1,4 +1,4 @@
-"""The critic's losses and explained variance: numbers worked by hand, derivatives and bad shapes."""
+"""The critic's losses and explained variance: numbers computed by hand, derivatives and bad shapes."""
 
 import pytest
 import torch
@@ -22,10 +22,10 @@ def test_clipped_squared_error_by_hand() -> None:
     """The old value is 0 and the clip 1 everywhere."""
     values = row(3, 3, -3, 0.5).requires_grad_()
     loss = clipped_squared_error(values, row(0, 0, 0, 0), row(4, 1, 4, 4), 1.0)
-    # moved 3 towards 4, more than is allowed: judged at 1, 0.5 * 3^2, and flat
-    # moved past its target 1: judged where it is, 0.5 * 2^2, and pulled back
-    # moved away from 4: judged where it is, 0.5 * 7^2, and pulled back
-    # moved 0.5, as is allowed: 0.5 * 3.5^2
+    # moved 3 towards 4, more than allowed: evaluated at 1, 0.5 * 3^2, and flat
+    # moved past its target 1: evaluated where it is, 0.5 * 2^2, and pulled back
+    # moved away from 4: evaluated where it is, 0.5 * 7^2, and pulled back
+    # moved 0.5, which is allowed: 0.5 * 3.5^2
     assert loss.tolist() == [[4.5, 2, 24.5, 6.125]]
     loss.sum().backward()
     assert values.grad is not None

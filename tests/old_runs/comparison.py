@@ -1,7 +1,7 @@
-"""Whether an outcome is as recorded: to the bit where the machine is as it was, else within a tolerance.
+"""Whether an outcome matches the record: bit for bit on a matching machine, else within a tolerance.
 
-Whatever was recorded must be there and be the same; what is new since then, a metric or a setting, is let
-pass. Text, whole numbers, truth values and lengths are the same everywhere; only floats may have a tolerance.
+Everything recorded must exist and be equal; new metrics and settings are allowed. Text, whole numbers, truth
+values and lengths must be equal everywhere; only floats may have a tolerance.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SHOWN = 8
 
 
 def machine() -> dict[str, str]:
-    """What the bits depend on here: libraries, Python, the processor's type and instructions."""
+    """Everything that affects the bits here: libraries, Python, the processor's type and instructions."""
     for name in LIBRARIES:
         importlib.import_module(name)
     from llvmlite import binding
@@ -39,7 +39,7 @@ def machine() -> dict[str, str]:
 
 
 class How(NamedTuple):
-    """How to compare, and why so."""
+    """The comparison to use, and the reason."""
 
     bits: bool
     why: str
@@ -54,9 +54,9 @@ class How(NamedTuple):
 
 
 def how(recorded: dict[str, str], here: dict[str, str], *, language: bool = True) -> How:
-    """To the bit where ``here`` is the machine on which it was recorded, in all that the bits depend on.
+    """Bit for bit if ``here`` matches the recording machine in everything that affects the bits.
 
-    The control story uses none of the libraries of the language story.
+    Control uses none of the libraries of language.
     """
     names = {*recorded, *here} - (set() if language else {"transformers", "tokenizers"})
     changed = [name for name in sorted(names) if recorded.get(name) != here.get(name)]
@@ -65,7 +65,7 @@ def how(recorded: dict[str, str], here: dict[str, str], *, language: bool = True
 
 
 def differences(recorded: Any, found: Any, bits: bool, where: str = "") -> list[str]:
-    """Where ``found`` is not as recorded, a line each; JSON values, or tensors in a dict."""
+    """The differences of ``found`` from the record, one line each; JSON values, or tensors in a dict."""
     if isinstance(recorded, dict) and isinstance(found, dict):
         lost = [f"{where}: {name!r} is not there any more" for name in recorded if name not in found]
         inside = [name for name in recorded if name in found]
@@ -98,7 +98,7 @@ def _tensor(recorded: torch.Tensor, found: torch.Tensor, bits: bool, where: str)
 
 
 def require_same(recorded: Any, found: Any, way: How, name: str) -> None:
-    """AssertionError saying how it was compared and where the outcome differs."""
+    """AssertionError with the kind of comparison and the differences."""
     lines = differences(recorded, found, way.bits, name)
     more = [f"... and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
     advice = "Is it meant? CONTRIBUTING.md, house rules, says what such a change brings."

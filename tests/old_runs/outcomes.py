@@ -1,7 +1,7 @@
-"""What a run folder still gives: loaded, evaluated, used and resumed, as numbers and tensors.
+"""The results of a run folder: loaded, evaluated, used and resumed, as numbers and tensors.
 
-`write.py` records this with the code of a day, `test_old_runs.py` asks for it again with the code of today.
-Paths in the runs are relative: whoever calls stands in a copy of the folder of that day.
+`write.py` records them with the code of a day, `test_old_runs.py` computes them with the current code. Paths
+in the runs are relative: call this from a copy of the folder of that day.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ CLOCKS = ("seconds", "wall_seconds", "records", "run_dir")  # records: bytes of 
 
 
 class Outcome(NamedTuple):
-    """What is compared: plain JSON, and tensors by name."""
+    """The compared values: plain JSON, and tensors by name."""
 
     numbers: Any
     tensors: Tensors
 
 
 class Walk(gym.Env):
-    """A noisy walk that gives its state: a run of it is restored in the middle of an episode."""
+    """A noisy walk that saves its state, so that its runs resume in the middle of an episode."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = gym.spaces.Discrete(2)
@@ -66,7 +66,7 @@ class Walk(gym.Env):
 
 
 def walk() -> gym.Env:
-    """What the run called walk was trained on."""
+    """The environment of the run called walk."""
     return gym.wrappers.TimeLimit(Walk(), 40)
 
 
@@ -74,7 +74,7 @@ ENVIRONMENTS: dict[str, Any] = {"cartpole": None, "pendulum": None, "walk": walk
 
 
 def without_clocks(value: Any) -> Any:
-    """JSON without what a clock gave."""
+    """JSON without clock times."""
     if isinstance(value, list):
         return [without_clocks(item) for item in value]
     if not isinstance(value, dict):
@@ -84,7 +84,7 @@ def without_clocks(value: Any) -> Any:
 
 
 def outcome(numbers: Any, tensors: Tensors | None = None) -> Outcome:
-    """Numbers as a JSON file would give them back, without clocks."""
+    """Numbers as read back from a JSON file, without clock times."""
     return Outcome(without_clocks(json.loads(dumps(numbers))), tensors or {})
 
 
@@ -165,7 +165,7 @@ def used_reward(name: str) -> Outcome:
 
 
 def used_align(name: str) -> Outcome:
-    """What ``tightrope sample`` says of a finished run, and the aligned model's probabilities."""
+    """The output of ``tightrope sample`` for a finished run, and the aligned model's probabilities."""
     from tightrope.language.compare import sample_run
 
     return outcome({"samples": sample_run(name, count=3), "log p": log_probabilities(Path(name) / "model")})
@@ -175,7 +175,7 @@ def used_align(name: str) -> Outcome:
 
 
 def end_of(name: str) -> Outcome:
-    """What a run came to: its rows, its last checkpoint, the best policy and the models it leaves."""
+    """The results of a run: its rows, its last checkpoint, the best policy and its models."""
     from safetensors.torch import load_file
 
     path = Path(name)
@@ -194,7 +194,7 @@ def end_of(name: str) -> Outcome:
 
 
 def resumed(name: str) -> Outcome:
-    """The killed run, resumed to its end as its user would."""
+    """The killed run, resumed to its end as a user would."""
     if ENVIRONMENTS.get(name) is not None:
         train.resume(name, env=ENVIRONMENTS[name])
     elif code := main(["resume", name, "--quiet"]):

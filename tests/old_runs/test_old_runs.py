@@ -1,17 +1,17 @@
-"""Old runs stay readable: run folders of an earlier day evaluate, load and resume to the same bits.
+"""Old runs stay readable: older run folders evaluate, load and resume to the same bits.
 
-Each folder here that is named after a day holds runs as the code of that day left them, killed in the middle
-or finished, and in `expected/` what they gave: actions, values, returns, scores, log-probabilities, samples,
-and after a resume every row, weight, moment of the optimiser, generator and counter. `write.py` says how they
-were made.
+Each folder named after a day contains runs written by the code of that day, killed in the middle or finished.
+Its `expected/` contains their results: actions, values, returns, scores, log-probabilities, samples, and
+after a resume every row, weight, optimiser moment, generator and counter. `write.py` describes how they were
+made.
 
-Bits depend on the libraries and on the processor. Where both are as recorded, everything is compared to the
-bit; elsewhere floats may differ by a tolerance, and nothing else may. The name of a test says which of the
-two it was, its message why. Nothing is ever skipped.
+Bits depend on the libraries and the processor. If both match the record, everything is compared bit for bit;
+otherwise floats may differ by a tolerance, and nothing else may. The name of a test states which comparison
+it used, its message why. No test is ever skipped.
 
-A change that makes these tests fail and is meant: say in the changelog what it does to old runs, record again
-what the old folders give (`write.py FOLDER --expected`), and write a new folder beside them. The run folders
-themselves are never written again.
+If a change makes these tests fail on purpose: state its effect on old runs in the changelog, record their
+results again (`write.py FOLDER --expected`), and write a new folder beside them. The run folders themselves
+are never rewritten.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def own_threads() -> Any:
 
 @pytest.fixture
 def stand_in(tmp_path, monkeypatch) -> Any:
-    """Go into a copy of the folder of a day: paths in its runs are relative to it."""
+    """Change into a copy of the folder of a day: paths in its runs are relative to it."""
 
     def go(day: Path) -> None:
         copied = tmp_path / day.name
@@ -104,7 +104,7 @@ def test_the_command_evaluates_an_old_run(stand_in, capsys, day):
 
 
 def test_the_first_day_is_whole():
-    """No question is lost, and every file of the runs is what its checkpoint says."""
+    """No question is missing, and every file of the runs matches its checkpoint."""
     assert FIRST.name == "2026-11-22"
     assert {path.stem for path in (FIRST / "expected").iterdir()} == {*ASKED, "machine"}
     folders = [path.parent for path in FIRST.rglob("manifest.json")]
@@ -114,7 +114,7 @@ def test_the_first_day_is_whole():
 
 
 def test_a_resume_has_work_to_do():
-    """Behind the newest checkpoint of a killed run stand rows that are to be cut off and made again."""
+    """A killed run has rows after its newest checkpoint, which a resume must cut off and repeat."""
     for name in (*ENVIRONMENTS, "sft-killed", "reward-killed", "align-killed"):
         run = FIRST / name
         rows = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
@@ -205,7 +205,7 @@ def test_what_is_new_is_let_pass(end):
     assert not differences(end, more, bits=True)
 
 
-def test_another_machine_has_a_tolerance_and_says_why(end):
+def test_another_machine_has_a_tolerance_with_a_reason(end):
     was = read(FIRST / "expected" / "machine.json")
     assert how(was, dict(was)).bits
     for name in was:

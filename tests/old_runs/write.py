@@ -1,4 +1,4 @@
-"""Write the run folders of a day, and what they must give ever after.
+"""Write the run folders of a day and their expected results.
 
 The folder 2026-11-22 was written by the code of commit e364bf9 and this script as it was at 272412e:
 
@@ -11,13 +11,12 @@ A new one, with the code of today, beside the old ones:
 
     PYTHONPATH=src:tests python tests/old_runs/write.py tests/old_runs/YYYY-MM-DD
 
-``--expected`` leaves the runs as they are, which are never written again, and records again what they give:
-for a change that means to change it. What was used (Python, libraries, processor) stands in
-expected/machine.json.
+``--expected`` does not touch the runs, which are never rewritten, and records their results again: for a
+change that alters them on purpose. expected/machine.json records Python, libraries and processor.
 
-Runs that end in ``-killed``, and those of the control story, are as SIGKILL left them behind a checkpoint:
-rows that no checkpoint counts on, the note of a writer that is gone. sft, reward and align came to their end.
-Before anything is recorded, each killed run is resumed and compared, to the bit, with an uninterrupted one.
+Runs that end in ``-killed``, and the control runs, were killed by SIGKILL after a checkpoint: they have rows
+after it and the lock note of a writer that is gone. sft, reward and align are finished. Before anything is
+recorded, each killed run is resumed and compared, bit for bit, with an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -131,7 +130,7 @@ def base_model(folder: Path) -> None:
 
 
 def write_data() -> None:
-    """Texts, pairs and prompts, in the present folder."""
+    """Texts, pairs and prompts, in the current folder."""
     texts = [f"{a} is {b}." for a, b in zip("abcdefgh", "ponmlkji", strict=True)]
     pairs = [{"prompt": f"{c} is ", "chosen": "good.", "rejected": "bad, why?"} for c in "abcdefgh"]
     for name, rows in (("texts.jsonl", [{"text": text} for text in texts]), ("pairs.jsonl", pairs)):
@@ -161,7 +160,7 @@ def killed(name: str, run: str, at: int) -> None:
 
 
 def write_runs() -> None:
-    """Every run, in the present folder, each killed one compared with one that was left alone."""
+    """Every run, in the current folder, each killed one compared with an uninterrupted one."""
     base_model(Path("base"))
     write_data()
     for name, make in stories().items():
@@ -187,7 +186,7 @@ def everything(found: Outcome) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def copied(folder: Path) -> Iterator[None]:
-    """Stand in a copy of a folder."""
+    """Change into a copy of a folder."""
     with tempfile.TemporaryDirectory() as place:
         shutil.copytree(folder, Path(place, "copy"))
         with contextlib.chdir(Path(place, "copy")):
@@ -195,7 +194,7 @@ def copied(folder: Path) -> Iterator[None]:
 
 
 def write_expected(folder: Path) -> None:
-    """expected/ of the runs of a day; each question is asked of a fresh copy."""
+    """expected/ of the runs of a day; each question uses a fresh copy."""
     shutil.rmtree(folder / "expected", ignore_errors=True)
     kept: dict[str, Outcome] = {}
     for name, (run, question) in ASKED.items():
@@ -213,7 +212,7 @@ def write_expected(folder: Path) -> None:
 
 
 def main() -> None:
-    """Read the words, and write."""
+    """Read the arguments and write the folder."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", nargs="?", type=Path, help="the folder of the day")
     parser.add_argument("--expected", action="store_true", help="leave the runs, record again what they give")

@@ -1,8 +1,8 @@
-"""A disk that remembers what was asked of it, and can be cut off after any of it.
+"""A disk that records its operations and can crash after any of them.
 
-`Disk` follows every file operation below a folder and repeats it in memory, with what POSIX promises about a
-crash: bytes are safe after fsync of their file, names after fsync of their folder, everything else may have
-arrived or not. `states` are the folders that a crash after any operation may leave.
+`Disk` follows every file operation below a folder and repeats it in memory under the rules of POSIX for a
+crash: bytes are safe after fsync of their file, names after fsync of their folder, everything else may be
+lost. `states` are the folders that a crash after any operation may leave.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ LOSSES = ("nothing", "bytes", "half of the bytes", "names")
 
 
 class File:
-    """Bytes, and how many of them are safe."""
+    """Bytes, and the number of safe ones."""
 
     def __init__(self, content: bytes = b"") -> None:
         self.content, self.safe = content, content
 
     def after(self, lost: str) -> bytes:
-        """What a crash leaves; a file that was cut back and not synced may still have its old end."""
+        """The content after a crash; a file that was cut back and not synced may still have its old end."""
         if lost == "nothing":
             return self.content
         if lost == "half of the bytes":
@@ -34,7 +34,7 @@ class File:
 
 
 class Folder:
-    """Names, and those that are safe."""
+    """Names, and the safe ones."""
 
     def __init__(self) -> None:
         self.names: dict[str, File | Folder] = {}
@@ -42,7 +42,7 @@ class Folder:
 
 
 class Disk:
-    """Follows the operations below ``root`` from now on; ``log`` holds them."""
+    """From now on, records the operations below ``root`` in ``log``."""
 
     def __init__(self, patch: pytest.MonkeyPatch, root: Path) -> None:
         self.root, self.log, self._open, self._deaf = root, list[tuple[Any, ...]](), dict[int, Path](), False
@@ -91,7 +91,7 @@ class Disk:
             self.log.append(("mkdir" if name == "mkdir" else "remove", Path(args[0])))
 
     def states(self, place: Path) -> Iterator[tuple[int, str, Path]]:
-        """Every folder that a crash may leave: operations before it, what is lost, where it lies."""
+        """Every folder that a crash may leave: the operations before it, the losses and its path."""
         tree = self.start
         for count in range(len(self.log) + 1):
             for lost in LOSSES:

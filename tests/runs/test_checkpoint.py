@@ -1,4 +1,4 @@
-"""A checkpoint is whole or absent, comes back to the bit, and any damage is named and refused."""
+"""A checkpoint is complete or absent, loads bit for bit, and any damage is named and refused."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def truncate(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
-def rewrite_manifest(**changes: object):  # a manifest that agrees with the folder in everything but these
+def rewrite_manifest(**changes: object):  # a manifest that matches the folder except for these
     def damage(folder: Path) -> None:
         path = folder / "manifest.json"
         path.write_bytes(checkpoint._manifest_text({**json.loads(path.read_text()), **changes}))
@@ -90,7 +90,7 @@ def rewrite_manifest(**changes: object):  # a manifest that agrees with the fold
 
 
 def rewrite_plain(folder: Path, **changes: object) -> None:
-    """A manifest that is changed and keeps the hash it had."""
+    """An edited manifest with its old hash."""
     path = folder / "manifest.json"
     manifest = {**json.loads(path.read_text()), **changes}
     path.write_text(json.dumps({k: v for k, v in manifest.items() if v is not None}, indent=2) + "\n")
@@ -218,7 +218,7 @@ def test_a_save_that_fails_leaves_nothing(
         (SafetensorError("No space left on device (os error 28)"), 28, "Make room on the disk"),
     ],
 )
-def test_what_the_disk_refuses_is_said_with_the_path_and_what_to_do(
+def test_disk_errors_name_the_path_and_the_remedy(
     tmp_path: Path, cause: Exception, number: int, advice: str
 ) -> None:
     with pytest.raises(CannotWrite) as error, writing(tmp_path / "c"):
@@ -228,7 +228,7 @@ def test_what_the_disk_refuses_is_said_with_the_path_and_what_to_do(
     assert advice in str(error.value) and str(cause.args[-1]) in str(error.value)
 
 
-def test_the_manifest_says_what_it_was_written_with(folder: Path) -> None:
+def test_the_manifest_names_the_versions_that_wrote_it(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     assert set(manifest) == {
         "format", "version", "step", "files", "versions", "settings_sha256", "sha256"
@@ -267,7 +267,7 @@ def test_a_manifest_imports_no_library(tmp_path: Path) -> None:
     }
 
 
-def test_other_versions_are_told(folder: Path) -> None:
+def test_other_versions_are_reported(folder: Path) -> None:
     written = checkpoint.read_manifest(folder)["versions"]
     assert versions.version_changes(written) == ""
     assert versions.version_changes({**written, "torch": "1.0"}) == f"torch 1.0 -> {torch.__version__}"
@@ -280,7 +280,7 @@ DTYPES = [
 
 
 def test_every_reader_of_safetensors_reads_ours(tmp_path: Path) -> None:
-    """The same tensors as the library's own writer, of every dtype and shape, views and empty ones too."""
+    """The same tensors as the safetensors writer, for every dtype and shape, with views and empty ones."""
     random = torch.Generator().manual_seed(0)
     wanted = {}
     for dtype in DTYPES:

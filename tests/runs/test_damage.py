@@ -1,4 +1,4 @@
-"""Whatever happens to the bytes of a checkpoint is seen, the file is named, and the older one is used."""
+"""Any change to the bytes of a checkpoint is detected, the file is named, and the older one is used."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FILES = ("manifest.json", "state.json", "policy.safetensors", "optimiser.safeten
 
 @pytest.fixture
 def checkpoints(tmp_path: Path) -> Iterator[Path]:
-    """Two steps, no file of one equal to its namesake of the other."""
+    """Two steps whose files all differ."""
     for step in (100, 200):
         tensors = {
             "policy": {"w": torch.full((3, 3), step + 0.5), "b": torch.zeros(2)},
@@ -32,7 +32,7 @@ def checkpoints(tmp_path: Path) -> Iterator[Path]:
 
 
 def used(checkpoints: Path) -> tuple[int, str]:
-    """The step that is used, and what was said of the others."""
+    """The step in use, and the messages about the others."""
     told: list[str] = []
     point = history.valid(checkpoints, told.append)
     assert point.state["step"] == checkpoint.step_of(point.folder)
@@ -77,7 +77,7 @@ def test_files_swapped_between_steps_are_seen(checkpoints: Path, name: str) -> N
     new.write_bytes(content[0])
     step, told = used(checkpoints)
     assert step == 100 and str(new.parent) in told
-    assert name == "manifest.json" or name in told  # a whole manifest says that the step is another
+    assert name == "manifest.json" or name in told  # a valid manifest states another step
     old.write_bytes(content[1])
     with pytest.raises(CheckpointError, match="none of 2 can be used"):
         history.valid(checkpoints, lambda text: None)

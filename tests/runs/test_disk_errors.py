@@ -1,4 +1,4 @@
-"""A disk that is full, read-only or closed to us costs nothing that was saved, and is said with advice."""
+"""A full, read-only or forbidden disk does not cost anything already saved; the error gives advice."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def update(run: Run, step: int) -> None:
 
 
 def check(run: Run, newest: int) -> None:
-    """The run goes on from ``newest``, with every row up to it, none twice, and nothing half-written."""
+    """The run continues from ``newest``, with every row up to it once, and nothing half-written."""
     run.close()
     with Run.open(run.path) as again:
         point = again.resume_point(pytest.fail, pytest.fail)
@@ -56,7 +56,7 @@ def check(run: Run, newest: int) -> None:
 
 @contextlib.contextmanager
 def room(patch: pytest.MonkeyPatch, size: int) -> Iterator[None]:
-    """Inside, the disk takes ``size`` bytes more: then the write that exceeds them is short, or refused."""
+    """The disk accepts ``size`` more bytes; the write that exceeds them is short, or refused."""
     write, left = os.write, [size]
 
     def refusing(descriptor: int, content: Any) -> int:
@@ -73,7 +73,7 @@ def room(patch: pytest.MonkeyPatch, size: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("part", range(4))
 def test_a_disk_that_is_full_at_any_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
-    """Fifty places, over everything that an update and a save write."""
+    """Fifty points, spread over all writes of an update and a save."""
     sizes = [200 * place + 3 for place in range(part, 52, 4)]
     failed = 0
     for size in sizes:
@@ -89,7 +89,7 @@ def test_a_disk_that_is_full_at_any_byte(tmp_path: Path, monkeypatch: pytest.Mon
             check(run, 20)
         else:
             check(run, 30)
-    assert len(sizes) > failed > len(sizes) // 2  # the last places are behind the end
+    assert len(sizes) > failed > len(sizes) // 2  # the last points are after the end
 
 
 def test_a_line_that_found_no_room_leaves_whole_lines(
@@ -107,7 +107,7 @@ def test_a_line_that_found_no_room_leaves_whole_lines(
 
 @contextlib.contextmanager
 def small_disk(path: Path) -> Iterator[str]:
-    """A file system of 256 KB where this process may mount one, else files of 40 KB at most; both real."""
+    """A real file system of 256 KB if this process may mount one, else a real file limit of 40 KB."""
     path.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(path)]
     try:
@@ -143,7 +143,7 @@ def test_a_small_disk_that_is_filled_by_a_save(tmp_path: Path) -> None:
 def test_a_folder_that_may_no_longer_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, advice: str
 ) -> None:
-    """By refusing calls, as the system does: root may write anywhere."""
+    """Refuses calls as the system does, because root may write anywhere."""
     run, opened = begun(tmp_path / "run"), os.open
     before = {p: p.read_bytes() for p in run.path.rglob("*") if p.is_file()}
 
@@ -175,7 +175,7 @@ def test_a_folder_that_may_no_longer_be_written(
         run.close()
         with pytest.raises(CannotWrite, match=advice):
             Run.open(run.path).lock()
-        assert Run.open(run.path).newest().state["step"] == 20  # readers read on
+        assert Run.open(run.path).newest().state["step"] == 20  # readers still work
     after = {p: p.read_bytes() for p in run.path.rglob("*") if p.is_file()}
     assert {p.name for p in after} == {p.name for p in before}
     assert {k: v for k, v in after.items() if k.name != "writer.lock"} == {

@@ -1,4 +1,4 @@
-"""The events of every command, and what listeners can ask for."""
+"""The events of every command, and the requests of listeners."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_what_a_run_sends(run: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_every_display_knows_a_warning_by_its_level(quiet: bool, capsys: pytest.CaptureFixture[str]) -> None:
-    """The text of a fact may begin with any word; that of a warning need not."""
+    """The text of an information line may begin with any word; a warning's need not."""
     import sys
 
     for view in (display.CONTROL, display.SFT, display.REWARD, display.ALIGN):
@@ -101,7 +101,7 @@ class Killed(Exception):
 
 
 def change_at(step: int, die_at: int | None = None) -> Any:
-    """A listener that changes the learning rate behind a step, and ends the run behind another."""
+    """A listener that changes the learning rate after one step and ends the run after another."""
 
     def listen(event: Event) -> Change | None:
         if isinstance(event, Updated) and event.step == die_at:

@@ -1,4 +1,4 @@
-"""A run has one writer, named to whoever comes second; a killed one is in no way; readers never wait."""
+"""A run has one writer, named in a second writer's error; a killed one does not block; readers never wait."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def end(process: subprocess.Popen[str]) -> None:
     process.stdout.close()
 
 
-def test_a_second_writer_is_refused_and_told_who_writes(path: Path) -> None:
+def test_a_second_writer_is_refused_with_the_name_of_the_first(path: Path) -> None:
     first = writer(path)
     try:
         before = {p.name: p.read_bytes() for p in path.iterdir() if p.is_file()}
@@ -110,7 +110,7 @@ def test_a_child_that_outlives_a_killed_writer_holds_nothing(path: Path) -> None
             try:
                 Run.open(path).lock().close()
                 break
-            except RunInUse:  # the child lets go when it first runs, which a busy machine may put off
+            except RunInUse:  # the child releases the lock when it first runs, which a busy machine may delay
                 if time.monotonic() - begin > 10:
                     raise
                 time.sleep(0.05)
@@ -119,10 +119,10 @@ def test_a_child_that_outlives_a_killed_writer_holds_nothing(path: Path) -> None
 
 
 @pytest.mark.parametrize("content", [None, "", "{", '{"env": "CartPole-v1"}'])
-def test_resume_on_the_command_line_names_the_writer_whatever_the_settings_hold(
+def test_resume_on_the_command_line_names_the_writer_for_any_settings(
     path: Path, content: str | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Their file may be half written by whoever holds the lock."""
+    """The process that holds the lock may have written half of their file."""
     from tightrope.cli.main import main
 
     with Run.open(path).lock():
@@ -156,7 +156,7 @@ def test_one_process_has_one_writer_too(path: Path) -> None:
 
 
 def test_a_run_that_is_let_go_is_free_again(path: Path) -> None:
-    Run.open(path).lock()  # no close: nobody holds it any more
+    Run.open(path).lock()  # not closed: no process holds it any more
     Run.open(path).lock().close()
 
 
@@ -172,7 +172,7 @@ def test_the_lock_is_no_link(path: Path, tmp_path: Path) -> None:
     assert (tmp_path / "precious").read_text() == "mine"
 
 
-def test_a_folder_that_holds_a_lock_alone_is_free(tmp_path: Path) -> None:
+def test_a_folder_with_only_a_lock_is_free(tmp_path: Path) -> None:
     (tmp_path / NAME).write_text("")
     Run.create(tmp_path, {"seed": 1}, "name").close()
     with pytest.raises(ValueError, match="not empty"):
@@ -180,7 +180,7 @@ def test_a_folder_that_holds_a_lock_alone_is_free(tmp_path: Path) -> None:
 
 
 def test_readers_read_while_it_is_written(path: Path) -> None:
-    """Checkpoints come and go: each read is whole, and newer than the one before."""
+    """Checkpoints come and go: each read is complete, and newer than the previous one."""
     first = writer(path, "write")
     try:
         seen, rows, until = [5], 1, time.monotonic() + 60

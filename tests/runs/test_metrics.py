@@ -90,11 +90,11 @@ LANGUAGE = [
 
 
 def test_a_metric_that_is_never_logged_is_not_declared() -> None:
-    """Gold scores are those of held-out prompts, eval/gold."""
+    """Gold scores belong to held-out prompts, eval/gold."""
     assert "objective/gold" not in METRICS
 
 
-def test_the_tolerance_of_language_is_told_where_ratios_are_watched() -> None:
+def test_the_tolerance_of_language_is_documented_with_the_ratios() -> None:
     from tightrope.language.generation.sample import LOG_RATIO_LIMIT
 
     assert f"language: up to {LOG_RATIO_LIMIT:g}" in METRICS["train/log_ratio_first"].doc

@@ -1,4 +1,4 @@
-"""What belongs to the whole process is afterwards what it was before, also when a public function raises."""
+"""Public functions restore the state of the process, even when they raise."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM, signal.SIGVTALRM, sign
 
 
 def state() -> dict[str, Any]:
-    """What a program that calls the library relies on. Torch's random numbers may be used, never seeded."""
+    """The state that a calling program relies on. Torch's random numbers may be used, never seeded."""
     numbers = np.random.get_state(legacy=False)  # noqa: NPY002
     pools = [(x["filepath"], x["num_threads"]) for x in threadpool_info()]
     return {
@@ -66,7 +66,7 @@ def state() -> dict[str, Any]:
 
 @contextlib.contextmanager
 def unchanged() -> Iterator[None]:
-    torch.set_num_threads(2)  # whatever a run before has left
+    torch.set_num_threads(2)  # left by an earlier run
     before = state()
     yield
     after = state()
@@ -74,7 +74,7 @@ def unchanged() -> Iterator[None]:
 
 
 class Enough(Exception):
-    """What ends a run in the middle."""
+    """Ends a run in the middle."""
 
 
 def stopping(event: Event) -> None:
@@ -95,7 +95,7 @@ CONTROL = TrainSettings(env="CartPole-v1", num_envs=2, total_steps=256, threads=
 
 @pytest.fixture(scope="module")
 def control(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run; whatever is imported or compiled first is there afterwards."""
+    """A finished run, so that all first imports and compilations have happened."""
     path = tmp_path_factory.mktemp("control") / "run"
     train(CONTROL, run_dir=path)
     return path
@@ -157,7 +157,7 @@ def test_alignment(model: str, tmp_path: Path) -> None:
         align(run_dir=run, listeners=[stopping], **given, **values)
     with unchanged(), pytest.raises(Enough):
         resume_align(run, listeners=[stopping], **given)
-    # resume_align itself has to set the threads, and to put them back
+    # resume_align itself must set the threads and restore them
     torch.set_num_threads(2)
     seen: list[int] = []
     with unchanged():

@@ -1,4 +1,4 @@
-"""The newest checkpoints and the best one stay, and nothing goes before a newer one has been read back."""
+"""The newest checkpoints and the best one stay; none is deleted before a newer one has been read back."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_save_that_fails_prunes_nothing(run: Run, monkeypatch: pytest.MonkeyPa
 def test_failures_at_random_never_cost_the_best_or_the_last(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thousand operations, one in nine of them refused: what was saved can be loaded, the best included."""
+    """A thousand operations, one in nine refused: everything saved can be loaded, including the best."""
     draw, write, merits, saved = random.Random(3), checkpoint.write_file, dict[int, float](), list[int]()
 
     def sometimes(*args: Any, **more: Any) -> Any:
@@ -111,7 +111,7 @@ def test_failures_at_random_never_cost_the_best_or_the_last(
     assert 5 < 59 - len(saved) < 40
 
 
-def test_an_old_one_that_cannot_be_deleted_is_said_and_no_failure(
+def test_an_old_one_that_cannot_be_deleted_is_reported_and_is_no_failure(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[str] = []

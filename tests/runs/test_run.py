@@ -1,4 +1,4 @@
-"""A run folder holds what it promises, in JSON that every reader accepts, and is never overwritten."""
+"""A run folder has all documented files, in JSON that every reader accepts, and is never overwritten."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_settings_are_there_before_the_first_step(tmp_path: Path) -> None:
 
 
 def test_a_changed_digit_of_the_settings_is_found(tmp_path: Path) -> None:
-    """Readers may look at them; a caller that resumes the run may not."""
+    """Readers accept them; a resume does not."""
     run = Run.create(tmp_path / "a", {"clip": 0.25, "steps": 3000, "lr": 1e-3}, "name")
     file = run.path / "settings.json"
     text, found = file.read_text(), 0
@@ -64,10 +64,10 @@ def test_a_changed_digit_of_the_settings_is_found(tmp_path: Path) -> None:
         assert again.settings == {"steps": 7000}
 
 
-def test_who_goes_on_reads_the_settings_behind_the_lock(
+def test_a_resume_reads_the_settings_after_taking_the_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The writer before changes the settings at the last moment: nobody sees those of before."""
+    """The previous writer changes the settings at the last moment: no process sees the old ones."""
     run = Run.create(tmp_path / "a", {"steps": 3000}, "name")
     run.close()
     real = WriterLock.__init__
@@ -140,7 +140,7 @@ KEEP: dict[str, Any] = {"keep": None, "warn": fail}
 
 
 def test_rewind_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
-    """To the byte: rows of the checkpoint's own step that were recorded after it go too."""
+    """To the byte: rows of the checkpoint's own step that were recorded after it are also removed."""
     with saved(tmp_path / "a", 10, 20) as run:
         wanted = [(run.path / name).read_bytes() for name in ("metrics.jsonl", "episodes.jsonl")]
         run.record_episodes([{"step": 20, "return": 1.0}])
@@ -162,7 +162,7 @@ def test_rewind_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
         assert not [name for name in left if name.startswith(".")]
 
 
-def test_without_a_checkpoint_a_run_begins_anew(tmp_path: Path) -> None:
+def test_without_a_checkpoint_a_run_starts_over(tmp_path: Path) -> None:
     with Run.create(tmp_path / "a", SETTINGS, "name") as run:
         run.record(10, 1.0, {})
         run.rewind(None)
@@ -196,7 +196,7 @@ def test_records_that_are_not_the_checkpoints_lead_to_an_older_one_or_a_clear_er
 
 
 def test_a_checkpoint_that_was_passed_over_is_put_aside(tmp_path: Path) -> None:
-    """Nobody takes it for the newest later, and the step can be saved again."""
+    """It is not mistaken for the newest later, and the step can be saved again."""
     with saved(tmp_path / "a", 10, 20) as run:
         (run.checkpoint_folder(20) / "state.json").write_text("{}")
         told: list[str] = []

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: what they raise and when, and what a stopped run tells, in real processes."""
+"""SIGINT and SIGTERM in real processes: their exceptions, and the messages of a stopped run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BOTH = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signa
 
 
 @BOTH
-def test_a_signal_stops_at_once_and_says_its_exit_code(number, code):
+def test_a_signal_stops_at_once_with_its_exit_code(number, code):
     before = signal.getsignal(number)
     with pytest.raises(signals.Stopped) as caught, signals.stoppable(), signals.stoppable():
         os.kill(os.getpid(), number)
@@ -99,7 +99,7 @@ def alive(pid: int) -> bool:
 
 @contextlib.contextmanager
 def started(run: Path, slow: float) -> Iterator[subprocess.Popen]:
-    """A run in a process of its own, gone at the end whatever a test has found."""
+    """A run in its own process, which always ends with the test."""
     pipe, environment = subprocess.PIPE, {**os.environ, "SLOW": str(slow)}
     words = [sys.executable, "-c", SLOW_SAVE, *TRAIN, "--run-dir", str(run)]
     with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
@@ -110,7 +110,7 @@ def started(run: Path, slow: float) -> Iterator[subprocess.Popen]:
 
 
 def allowed(seconds: float) -> float:
-    """Seconds of a machine that has a core to spare, on this one as busy as it is."""
+    """Seconds on an idle machine, scaled to the load of this one."""
     return seconds * max(1.0, os.getloadavg()[0] / len(os.sched_getaffinity(0)))
 
 

@@ -1,7 +1,7 @@
-"""A save that is cut off anywhere leaves the old checkpoint or the new one, whole.
+"""A save that is interrupted anywhere leaves the complete old checkpoint or the complete new one.
 
-Every operation of a save is recorded, and the folder rebuilt as a crash after each of them may leave it: with
-everything that was asked for, without the bytes or without the names that nothing had made safe (`disk.py`).
+Every operation of a save is recorded. The folder is rebuilt as a crash after each operation may leave it:
+with everything, without the unflushed bytes, or without the unflushed names (`disk.py`).
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ def test_cut_anywhere_a_fresh_save_leaves_the_older_or_the_newer(
     with monkeypatch.context() as patch:
         disk = Disk(patch, root)
         checkpoint.save(checkpoint.step_folder(root, 200), tensors(200), {"step": 200})
-    monkeypatch.setattr(os, "fsync", lambda descriptor: None)  # of what is rebuilt
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)  # of the rebuilt folder
     found = []
     for count, lost, place in disk.states(tmp_path / "after"):
-        point = history.valid(place, silent)  # a torn one would be told
+        point = history.valid(place, silent)  # a torn one would be reported
         assert torch.equal(point.tensors["policy"]["w"], torch.full((5,), float(point.state["step"])))
         found.append((count, lost, point.state["step"]))
         durable.remove_leftovers(place)
@@ -70,7 +70,7 @@ def test_cut_anywhere_a_replacement_leaves_the_old_or_the_new(
     assert {version for count, _, version in found if count == len(disk.log)} == {2}
 
 
-def test_cut_anywhere_a_run_goes_on_with_no_row_doubled_and_none_missing(
+def test_cut_anywhere_a_run_continues_with_no_row_twice_and_none_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, rows = tmp_path / "run", {}
@@ -103,7 +103,7 @@ def test_cut_anywhere_a_run_goes_on_with_no_row_doubled_and_none_missing(
 def test_the_disk_of_these_tests_loses_what_is_not_synced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the fsyncs of a save the same test fails: the matrix can tell."""
+    """Without the fsyncs of a save the same test fails: it can detect the loss."""
     root = tmp_path / "checkpoints"
     checkpoint.save(checkpoint.step_folder(root, 100), tensors(100), {})
     with monkeypatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Where compiled code is kept, how it comes back, and when the second thread helps."""
+"""Storing and loading compiled code, and the use of the second thread."""
 
 import hashlib
 import os
@@ -59,8 +59,8 @@ def start(caches):
 
 @pytest.fixture
 def warm(tmp_path):
-    """A cache directory with a copy of all that is compiled."""
-    from tightrope.control.engine import compiled_engine  # noqa: F401  (compiles what is not there yet)
+    """A cache directory with a copy of all compiled code."""
+    from tightrope.control.engine import compiled_engine  # noqa: F401  (compiles missing functions)
 
     folder = cache.cache_folder()
     if folder is None or cache.compilation_due():
@@ -88,7 +88,7 @@ def test_cache_can_be_switched_off(word, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_numbas_own_setting_is_left_alone():
+def test_numbas_own_setting_is_not_changed():
     import numba
 
     assert "tightrope" not in str(numba.config.CACHE_DIR)
@@ -147,7 +147,7 @@ def test_folders_long_out_of_use_are_removed(tmp_path, monkeypatch):
     assert {path.name for path in root.iterdir()} - {cache.cache_folder().name} == {"1" * 16, "not-ours"}
 
 
-def test_scipys_linear_algebra_is_whole_after_its_blas_was_taken_alone():
+def test_scipys_linear_algebra_works_after_only_its_blas_was_loaded():
     code = (
         "import tightrope.control.engine.compiled.primitives\n"
         "import scipy.linalg, scipy.linalg.cython_blas as b, numpy\n"
@@ -175,7 +175,7 @@ def test_choice_takes_the_quicker_way_and_tries_the_other_again():
         choices.append(choice.choose())
         choice.record(choices[-1], seconds[choices[-1]], 1)
     assert choices[:2] == [True, False]
-    assert sum(choices) == 2  # once to begin with, once to try again
+    assert sum(choices) == 2  # once at first, once for the retry
     seconds[True] = 0.5
     for _ in range(2 * ThreadChoice.RETRY):
         last = choice.choose()

@@ -1,4 +1,4 @@
-"""torch's parameters and torch's Adam stay the truth: the engine works on their memory and their state."""
+"""The engine works on the memory and state of torch's parameters and torch's Adam."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""A NaN or an infinity is caught before the step, named, and leaves weights and moments bit for bit alone."""
+"""A NaN or an infinity is named before the step; weights and moments stay bit-identical."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from tightrope.control.engine.compiled_engine import CompiledEngine
 
 
 def refuse(policy, optimiser, settings, batch, threads):
-    """Update and expect the refusal; returns its text and whether weights and moments are as before."""
+    """Update and expect the error; returns its text and whether weights and moments are unchanged."""
     engine = CompiledEngine(policy, optimiser, threads)
     before = numbers(policy)
     moments = [s[k].clone() for s in optimiser.state.values() for k in ("exp_avg", "exp_avg_sq", "step")]
@@ -44,7 +44,7 @@ def refuse(policy, optimiser, settings, batch, threads):
 )
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 def test_one_bad_number_of_the_batch(field, name, bad, threads, activation):
-    # one minibatch: the first step is the one that is refused
+    # one minibatch: the first step is refused
     policy, optimiser, settings = make(minibatch_size=320, value_clip=0.2, activation=activation)
     batch = make_batch(policy)
     tensor = batch.inputs["flat"] if field == "flat" else getattr(batch, field)
@@ -134,7 +134,7 @@ def test_compiled_code_sees_nan_and_infinity():
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 def test_a_gradient_that_overflows_while_data_weights_and_loss_are_finite(activation, threads):
-    """An input of 1e38 that weights of 0 keep out: finite everywhere but in the gradient of those."""
+    """An input of 1e38 behind weights of 0: everything is finite except the gradient of these weights."""
     policy, optimiser, settings = make(minibatch_size=320, activation=activation)
     batch = make_batch(policy)
     with torch.no_grad():

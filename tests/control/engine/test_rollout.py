@@ -1,4 +1,4 @@
-"""act, values and gae of the engine are those of torch."""
+"""act, values and gae of the engine match torch."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The compiled update is ppo.update: same parameters, metrics and permutations, whatever the settings."""
+"""The compiled update matches ppo.update: same parameters, metrics and permutations, for all settings."""
 
 import copy
 import dataclasses
