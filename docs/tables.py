@@ -35,12 +35,12 @@ def shown(value: Any) -> str:
 
 
 def metrics() -> list[str]:
-    """Every metric of a control run, from runs/metrics.py."""
+    """Every metric of a control run, from metrics/."""
     return _metric_table(of_story("control"))
 
 
 def language_metrics() -> list[str]:
-    """Every metric of a language run, from runs/metrics.py and runs/language_metrics.py."""
+    """Every metric of a language run, from metrics/."""
     table = _metric_table(of_story("language"))
     return table + [row(f"`{m.name}NAME`", m.unit, m.healthy, m.doc) for m in FAMILIES.values()]
 
