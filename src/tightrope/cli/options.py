@@ -25,6 +25,7 @@ from tightrope.cli.flags import (
 )
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 from tightrope.language.settings import RECIPES, AlignSettings, ModelSettings, RewardSettings, SFTSettings
+from tightrope.runs.folders import OWN_FIELDS
 from tightrope.runs.records import retyped
 from tightrope.settings.values import Settings, rule_of
 
@@ -79,8 +80,6 @@ DESCRIPTIONS: dict[str, tuple[str, str, str | None]] = {
         "Recipes: " + "; ".join(f"{name} ({recipe.source})" for name, recipe in RECIPES.items()),
     ),
 }
-# the setting by which the settings.json of a command is recognised
-OWN_FIELDS = {"sft": "on_completions", "reward": "demonstrations", "align": "max_new_tokens", "train": "env"}
 
 
 def print_json(value: dict[str, Any]) -> None:

@@ -15,7 +15,6 @@ from tightrope.cli import display
 from tightrope.cli.display import Display
 from tightrope.cli.flags import UsageError
 from tightrope.cli.options import (
-    OWN_FIELDS,
     PROGRAM,
     SETTINGS_CLASSES,
     Options,
@@ -26,6 +25,7 @@ from tightrope.cli.options import (
     training_options,
 )
 from tightrope.runs import checkpoint, signals
+from tightrope.runs.folders import OWN_FIELDS
 from tightrope.runs.run import Run
 from tightrope.settings.values import Settings
 

@@ -34,7 +34,7 @@ from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.rollout import Rollout, to_batch
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import Array, Inputs, ObservationLayout
+from tightrope.control.spaces import Array, Inputs, ObservationLayout, structure
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint
 from tightrope.training.events import Message
@@ -105,6 +105,11 @@ class Agent:
         ``start``: the agent step at which this budget began (default: now).
         """
         budget = self.settings.total_steps if total_steps is None else total_steps
+        if start is None and budget < self.environments.num_envs:
+            raise ValueError(
+                f"{budget} steps are less than one in each of {self.environments.num_envs} environments; "
+                "expected at least that many. Give more steps, or fewer num_envs."
+            )
         start = self.steps if start is None else start
         first, every = True, self.settings.checkpoint_every
         while (columns := self._next_columns(budget, start)) > 0:
@@ -193,7 +198,7 @@ class Agent:
         """The critic's V(s) in units of the return: a float for one observation, an array [N] for a batch."""
         layout = self.environments.observation_layout
         batched = _is_batched(layout, observation)
-        inputs = self.normalisers.encode(layout.encode(observation, batched=batched))
+        inputs = self.normalisers.encode(finite(layout.encode(observation, batched=batched)))
         values = self.policy.values(inputs).cpu().numpy()
         if self.normalisers.rewards is not None:
             values = values * self.normalisers.rewards.deviation
@@ -205,7 +210,7 @@ class Agent:
         """Action matrix [N, A] for observations as their layout encodes them: sampled with ``rng``, without
         it the most likely actions. ``action_mask`` bool [N, L].
         """
-        inputs = self.normalisers.encode(inputs)
+        inputs = self.normalisers.encode(finite(inputs))
         if action_mask is not None:
             inputs = {**inputs, "action_mask": action_mask}
         if rng is None:
@@ -255,6 +260,7 @@ class Agent:
             "kl_beta": self.kl_beta,
             "rollbacks": self.rollbacks,
             "environment_restarts": self.environments.restarts,
+            "spaces": self._spaces(),
             "own_policy": self.policy.own is not None,
             "own_environment": self.env is not None and not isinstance(self.env, str),
             "rng": {
@@ -263,6 +269,23 @@ class Agent:
             },
         }
         return tensors, state
+
+    def _spaces(self) -> dict[str, list[str]]:
+        environments = self.environments
+        return {
+            "observations": structure(environments.observation_layout.space),
+            "actions": structure(environments.action_layout.space),
+        }
+
+    def require_spaces(self, state: dict[str, Any]) -> None:
+        """ValueError when a saved policy was trained on other observations or actions than there are here."""
+        saved = state.get("spaces")  # missing in old runs
+        for name, here in self._spaces().items():
+            if isinstance(saved, dict) and saved.get(name) != here:
+                raise ValueError(
+                    f"The saved policy was trained on {name} {saved.get(name)}; this environment has {here}. "
+                    "Give an environment with the same spaces."
+                )
 
     def restore(self, tensors: Tensors, state: dict[str, Any]) -> None:
         """Put back what `snapshot` gave, into an agent of the same settings."""
@@ -381,6 +404,17 @@ def _normalisers(environments: Environments, settings: TrainSettings) -> Normali
         RewardNormaliser(environments.num_envs, settings.update.gamma) if settings.normalise_rewards else None
     )
     return Normalisers(observations, rewards)
+
+
+def finite(inputs: Inputs) -> Inputs:
+    """The inputs as they are. ValueError for a NaN or an infinity, from which any action could follow."""
+    good = np.isfinite(inputs["flat"]) if "flat" in inputs else np.True_
+    if not good.all():
+        row, index = np.argwhere(~good)[0]
+        raise ValueError(
+            f"observation {row} holds {inputs['flat'][row, index]} at index {index}; expected finite numbers."
+        )
+    return inputs
 
 
 def _is_batched(layout: ObservationLayout, observation: Any) -> bool:

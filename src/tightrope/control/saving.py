@@ -12,6 +12,7 @@ from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
+from tightrope.runs.folders import require_kind
 from tightrope.runs.history import Checkpoint
 from tightrope.runs.records import retyped
 
@@ -53,8 +54,13 @@ def load(
         )
         settings = dataclasses.replace(anywhere(settings), env=name, num_envs=rows)
     agent = rebuild(settings.env if env is None else env, path, policy=policy, settings=settings)
-    with checkpoint.understood(folder):
-        agent.restore(tensors, state)
+    try:
+        agent.require_spaces(state)
+        with checkpoint.understood(folder):
+            agent.restore(tensors, state)
+    except BaseException:
+        agent.close()
+        raise
     return agent
 
 
@@ -115,6 +121,7 @@ def read(path: Path, *, best: bool = False) -> Checkpoint:
     from tightrope.runs.run import Run
 
     run = Run.open(path)
+    require_kind(path, run.settings, "train")
     if not best:
         return run.newest()
     if not present(run.best).is_dir():

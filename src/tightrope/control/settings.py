@@ -30,11 +30,11 @@ class TrainSettings(Settings):
     seed: int = setting(
         0, "Seed of everything random; same seed and settings on one machine: same bits.", at_least=0
     )
-    num_envs: int = setting(8, "Copies of the task that run side by side.", at_least=1)
+    num_envs: int = setting(8, "Copies of the task that run side by side.", at_least=1, at_most=1_000_000)
     num_steps: int = setting(256, "Steps of each copy per rollout.", at_least=1)
 
     hidden: tuple[int, ...] = setting(
-        (64, 64), "Widths of the hidden layers of actor and critic.", at_least=1
+        (64, 64), "Widths of the hidden layers of actor and critic.", at_least=1, at_most=1_000_000
     )
     activation: str = setting("tanh", "Between the layers.", choices=("tanh", "relu", "elu", "silu"))
     shared: bool = setting(False, "Actor and critic share their hidden layers.")
@@ -65,6 +65,7 @@ class TrainSettings(Settings):
         None,
         "With workers: processes to spread the copies over; none: one a core, this process included.",
         at_least=1,
+        at_most=1024,
     )
     engine: str = setting(
         "auto",
@@ -76,6 +77,7 @@ class TrainSettings(Settings):
         None,
         "CPU threads of torch and BLAS; none: 1 for MLPs (more only spin), every core for images.",
         at_least=1,
+        at_most=1024,
     )
     compile: bool = setting(False, "Torch path: compile the model with torch.compile.")
 

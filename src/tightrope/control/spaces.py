@@ -44,6 +44,19 @@ def place_of(path: Path) -> str:
     return "".join(f"[{key!r}]" for key in path)
 
 
+def structure(space: Space) -> list[str]:
+    """Each basic space inside ``space`` as text: where it lies, its type, its shape or categories.
+
+    Bounds are left out: a policy may move to a task that has others.
+    """
+    found = []
+    for path, part in walk(space, "given"):
+        one_hot = isinstance(part, spaces.Discrete | spaces.MultiDiscrete)
+        size = categories(part)[0].tolist() if one_hot else list(part.shape or ())
+        found.append(f"{type(part).__name__}{place_of(path)}{size}")
+    return found
+
+
 def follow(value: Any, path: Path) -> Any:
     """The part of a nested value at ``path``."""
     for key in path:
@@ -391,7 +404,7 @@ class ActionLayout:
             per_row = array.ndim == 1 and len(array) == num and num > 1
             return np.concatenate([self.flatten_mask(row, 1) for row in array]) if per_row else None
         if array.shape == (num, self.num_logits) or (num == 1 and array.shape == (self.num_logits,)):
-            return array.reshape(num, self.num_logits).astype(bool)
+            return as_allowed(array).reshape(num, self.num_logits)
         return None
 
     def _write_mask(self, part: Any, components: list[Component], target: np.ndarray, whole: Any) -> None:
@@ -411,7 +424,7 @@ class ActionLayout:
                 continue
             if np.size(piece) != columns.size:
                 raise self._mask_error(whole, len(target))
-            columns[...] = np.asarray(piece).reshape(columns.shape).astype(bool)
+            columns[...] = as_allowed(np.asarray(piece)).reshape(columns.shape)
 
     def _mask_error(self, mask: Any, num: int) -> ValueError:
         shape = f"a {type(mask).__name__}" if isinstance(mask, dict | tuple) else f"shape {np.shape(mask)}"
@@ -427,6 +440,19 @@ class ActionLayout:
             if part.kind == "categorical":
                 open_rows &= mask[:, part.mask : part.mask + part.count].any(axis=1)
         return np.flatnonzero(~open_rows)
+
+
+def as_allowed(mask: np.ndarray) -> np.ndarray:
+    """A mask of True and False, or 1 and 0, as bool. ValueError for other numbers: -inf is not False."""
+    if mask.dtype.kind == "b":
+        return mask
+    wrong = (mask != 0) & (mask != 1)
+    if wrong.any():
+        raise ValueError(
+            f"the action mask holds {mask[wrong].flat[0]}; expected True (1) where a choice is allowed and "
+            "False (0) where it is not."
+        )
+    return mask.astype(bool)
 
 
 def action_layout(space: Space) -> ActionLayout:

@@ -17,6 +17,7 @@ from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
+from tightrope.runs.folders import require_kind
 from tightrope.runs.history import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.training import loop
@@ -75,6 +76,7 @@ def resume(
 
 def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, policy: Any) -> dict[str, Any]:
     run_dir = run.path
+    require_kind(run_dir, run.settings, "train")
     point = newest_point(run, listeners)
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
@@ -101,6 +103,11 @@ def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, p
     with contextlib.closing(agent), contextlib.closing(learner):
         if point is not None:
             learner.restore(point)
+        if learner.total < learner.position:
+            raise ValueError(
+                f"{run_dir} has done {learner.position:,} steps; expected total_steps of at least as many, "
+                f"got {learner.total:,}."
+            )
         continue_from(learner, run, point)
         if learner.complete:
             listeners.info(f"{run_dir} has its {learner.total} steps; --total-steps N continues from there.")
@@ -225,6 +232,7 @@ class AgentLearner:
 
     def restore(self, point: Checkpoint) -> None:
         """Put back a checkpoint. CheckpointError when it is not what an agent of these settings saved."""
+        self.agent.require_spaces(point.state)
         with understood(point.folder):
             self.agent.restore(point.tensors, point.state)
             if self.position != step_of(point.folder):

@@ -20,6 +20,7 @@ from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer
 from tightrope.language.model.packaged import find_model
 from tightrope.language.quiet import quiet_libraries
 from tightrope.language.settings import AlignSettings
+from tightrope.runs.folders import require_kind
 from tightrope.runs.run import Run
 
 
@@ -33,7 +34,9 @@ def sample_run(
     ``seed`` of sampling: by default the run's + 1. Raises ValueError where there is no finished run.
     """
     path = Path(path)
-    settings = AlignSettings.from_json(Run.open(path).settings, path / "settings.json")
+    run = Run.open(path)
+    require_kind(path, run.settings, "align")
+    settings = AlignSettings.from_json(run.settings, path / "settings.json")
     if seed is not None and seed < 0:
         raise ValueError(f"seed is {seed}, expected 0 or more.")
     if not (path / "model" / "config.json").is_file():

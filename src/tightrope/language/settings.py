@@ -31,7 +31,7 @@ class ModelSettings(Settings):
     seed: int = setting(0, "Seed of everything random.", at_least=0)
     device: str = setting("cpu", "Torch device: cpu, cuda, cuda:1, mps.")
     dtype: str = setting("float32", "Precision of the trunk.", choices=("float32", "bfloat16"))
-    threads: int | None = setting(None, "CPU threads of torch; none: every core.", at_least=1)
+    threads: int | None = setting(None, "CPU threads of torch; none: every core.", at_least=1, at_most=1024)
     gradient_checkpointing: bool = setting(
         False, "Compute activations again in the backward pass: less memory, a third more time."
     )

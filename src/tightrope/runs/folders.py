@@ -5,8 +5,28 @@ from __future__ import annotations
 import difflib
 import time
 from pathlib import Path
+from typing import Any
 
 from tightrope.runs.lock import NAME
+
+# the setting by which the settings.json of a command is recognised
+OWN_FIELDS = {"sft": "on_completions", "reward": "demonstrations", "align": "max_new_tokens", "train": "env"}
+USES = {
+    "train": "tightrope evaluate, record and resume, and tightrope.load in Python",
+    "sft": "tightrope resume; its model is in the folder `model`",
+    "reward": "tightrope resume; its model is in the folder `model`, and align takes it as --reward",
+    "align": "tightrope sample and resume; its model is in the folder `model`",
+}
+
+
+def require_kind(path: Path, settings: dict[str, Any], command: str) -> None:
+    """ValueError when these settings are of a run of another command; it names what can read that run."""
+    found = next((name for name, field in OWN_FIELDS.items() if field in settings), command)
+    if found != command:
+        raise ValueError(
+            f"{path} is a run of tightrope {found}, expected one of tightrope {command}. It is whole: use "
+            f"{USES[found]}."
+        )
 
 
 def require_free(path: Path) -> None:

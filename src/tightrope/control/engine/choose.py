@@ -20,6 +20,8 @@ def usable_device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"device is {name!r}, which cannot be used here ({reason}). Choose cpu.") from error
+    if device.type == "meta":
+        raise ValueError("device is 'meta', which holds no numbers. Choose cpu.")
     return device
 
 

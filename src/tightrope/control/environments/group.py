@@ -138,6 +138,7 @@ class EnvGroup:
         self._mask_sources = [MaskSource()] * len(envs)
         self._shape = envs[0].observation_space.shape
         self._plain = self.observation_layout.plain
+        self._dtype: np.dtype[Any] | None = None  # of plain observations, as last seen
         self._rows = [{k: a[i : i + 1] for k, a in buffers.inputs.items()} for i in range(len(envs))]
         self._finals = [{k: a[i : i + 1] for k, a in buffers.final_inputs.items()} for i in range(len(envs))]
         self._flat_rows = [row["flat"][0] for row in self._rows] if self._plain else []
@@ -207,7 +208,7 @@ class EnvGroup:
         # local names are faster, and this loop runs at every step
         buffers, plain, shape, checked = self.buffers, self._plain, self._shape, self._checked
         envs, rewards, flat_rows, current = self.envs, buffers.rewards, self._flat_rows, buffers.current
-        has_masks, strict = self.has_masks, self.policy.restart
+        has_masks, strict, dtype = self.has_masks, self.policy.restart, self._dtype
         row = begin
         try:
             for row, action in zip(range(begin, len(self.envs)), actions, strict=False):
@@ -222,10 +223,8 @@ class EnvGroup:
                 if terminated or truncated:
                     observation, info = self._end(row, observation, terminated)
                 if plain:
-                    if observation.shape != shape:
-                        raise ApiBreak(
-                            f"the observation has shape {observation.shape}, the space says {shape}"
-                        )
+                    if observation.shape != shape or observation.dtype is not dtype:
+                        dtype = self._checked_dtype(observation)
                     flat_rows[row][...] = observation
                 else:
                     self.observation_layout.write(observation, self._rows[row])
@@ -237,6 +236,17 @@ class EnvGroup:
             self._restart(row, error)
             return row + 1
         return len(self.envs)
+
+    def _checked_dtype(self, observation: np.ndarray) -> np.dtype[Any]:
+        """The dtype of a plain observation. ApiBreak: another shape, or no real numbers, which numpy would
+        store all the same (a text as the number it spells, a complex number without its imaginary part).
+        """
+        if observation.shape != self._shape:
+            raise ApiBreak(f"the observation has shape {observation.shape}, the space says {self._shape}")
+        if observation.dtype.kind not in "biuf":
+            raise ApiBreak(f"the observation is {observation!r}, expected an array of real numbers")
+        self._dtype = observation.dtype
+        return self._dtype
 
     def _end(self, row: int, observation: Any, terminated: bool) -> tuple[Any, dict[str, Any]]:
         """Record how the episode ended, keep a truncation's last observation, and reset."""
@@ -383,7 +393,7 @@ def _check_step(result: Any, has_masks: bool) -> None:
     if isinstance(reward, str | bytes | None) or np.ndim(reward) != 0:
         raise ApiBreak(f"the reward is {reward!r}, expected one number")
     for name, flag in (("terminated", terminated), ("truncated", truncated)):
-        if not isinstance(flag, bool | np.bool_ | int):
+        if not isinstance(flag, bool | np.bool_ | int) or flag not in (True, False):
             raise ApiBreak(f"{name} is {flag!r}, expected True or False")
     if not isinstance(info, dict):
         raise ApiBreak(f"info is {kind_of(info)}, expected a dict")

@@ -18,6 +18,8 @@ from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.spaces import Array, Inputs
 from tightrope.errors import TightropeError
 
+FLOAT32_MAX = float(np.finfo(np.float32).max)  # rewards are learned from in float32
+
 
 class BadNumbers(TightropeError, ValueError):
     """An environment returned a NaN or an infinity; nothing was learned from it."""
@@ -184,7 +186,7 @@ class Collector:
             if "flat" in x:
                 checks.append(("final observation", x["flat"][:, None], final_rows, first_step + t + 1, t))
         for what, numbers, which, first, column in checks:
-            good = np.isfinite(numbers)
+            good = np.abs(numbers) <= FLOAT32_MAX  # False for NaN; beyond it the learning overflows
             if good.all():
                 continue
             place, t, index = np.argwhere(~good)[0]
@@ -197,8 +199,9 @@ class Collector:
             raise BadNumbers(
                 f"Environment {row} of {environments.spec_id} returned {what} = {numbers[place, t, index]} "
                 f"at {where}{circumstances(environments.worker_of(row), environments.seed_of(row), action)}; "
-                "expected finite numbers. The policy was not updated with it. Fix the environment, or clip "
-                "and check its state there; --on-env-fault restart restarts it and continues."
+                f"expected finite numbers of at most {FLOAT32_MAX:.2g}. The policy was not updated with it. "
+                "Fix the environment, or clip and check its state there; --on-env-fault restart restarts it "
+                "and continues."
             )
 
     def _check_policy(self, rollout: Rollout, policy: nn.Module, num_steps: int) -> None:

@@ -16,6 +16,7 @@ from tightrope.language.alignment.iteration import Trainer
 from tightrope.language.quiet import quiet_libraries
 from tightrope.language.settings import AlignSettings, recorded
 from tightrope.language.supervised.prepare import threads
+from tightrope.runs.folders import require_kind
 from tightrope.runs.records import retyped
 from tightrope.runs.run import Run
 from tightrope.training import loop
@@ -105,6 +106,7 @@ def resume_align(
     were no file. ``total_episodes`` extends a finished run.
     """
     with Run.open(run_dir, own=True) as run:
+        require_kind(run.path, run.settings, "align")
         settings = AlignSettings.from_json(run.settings, run.path / "settings.json")
         if total_episodes is not None:
             settings = settings.with_values(total_episodes=total_episodes)

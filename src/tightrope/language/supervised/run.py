@@ -15,6 +15,7 @@ from tightrope.language.quiet import quiet_libraries
 from tightrope.language.settings import SupervisedSettings, recorded
 from tightrope.language.supervised.fit import Objective, SupervisedLearner
 from tightrope.language.supervised.prepare import Loaded, prepared
+from tightrope.runs.folders import require_kind
 from tightrope.runs.run import Run
 from tightrope.training import loop
 from tightrope.training.events import Listener, Listeners
@@ -67,6 +68,7 @@ def resume_stage(
     """
     events = Listeners(listeners)
     with Run.open(run_dir, own=True) as run:
+        require_kind(run.path, run.settings, stage.name)
         settings = stage.kind.from_json(run.settings, run.path / "settings.json")
         objects = {**given, "model": model and model[0]}
         for name, value in objects.items():

@@ -1,0 +1,225 @@
+"""Values that a library refuses, or takes for something else, are named with the remedy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import tightrope
+from tightrope.cli.main import main
+from tightrope.control.environments.faults import EnvironmentFault
+from tightrope.control.rollout.collector import BadNumbers
+from tightrope.control.saving import evaluate_run
+from tightrope.control.train import resume, train
+from tightrope.language.alignment.align import resume_align
+from tightrope.language.compare import sample_run
+from tightrope.language.settings import AlignSettings, RewardSettings, SFTSettings
+from tightrope.language.supervised.sft import resume_sft
+from tightrope.runs.run import Run
+
+SMALL: dict[str, Any] = {
+    "num_envs": 2,
+    "num_steps": 16,
+    "minibatch_size": 16,
+    "num_epochs": 1,
+    "engine": "torch",
+}
+
+
+@pytest.fixture(scope="module")
+def agent() -> tightrope.PPO:
+    return tightrope.PPO("CartPole-v1", **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (
+            {"seed": 99999999999999999999},
+            "seed is 99999999999999999999; expected at most 9223372036854775807",
+        ),
+        ({"seed": 10**309}, "seed is a number of more than 30 digits"),
+        ({"gamma": 10**309}, "gamma is a number of more than 30 digits"),
+        ({"hidden": (2**63,)}, "hidden is 9223372036854775808"),
+        ({"hidden": (10**18,)}, r"hidden is \(1000000000000000000,\); expected 1 <= x <= 1e\+06"),
+        ({"num_envs": 10**18}, r"num_envs is 1000000000000000000; expected 1 <= x <= 1e\+06"),
+        ({"threads": 1_000_000}, "threads is 1000000; expected 1 <= x <= 1024"),
+        ({"device": "meta"}, "device is 'meta', which holds no numbers. Choose cpu"),
+    ],
+)
+def test_settings_beyond_what_can_be_are_named(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        tightrope.PPO("CartPole-v1", **values)
+
+
+@pytest.mark.parametrize("steps", [1, 0, -5])
+def test_a_budget_of_less_than_a_step_in_each_environment(agent: tightrope.PPO, steps: int) -> None:
+    with pytest.raises(ValueError, match=f"{steps} steps are less than one in each of 2 environments"):
+        agent.learn(steps)
+    assert agent.steps == 0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_an_observation_that_is_not_finite_gives_no_action_and_no_value(
+    agent: tightrope.PPO, bad: float
+) -> None:
+    single = [0.0, 0.0, bad, 0.0]
+    for given, row in ((single, 0), ([[0.0] * 4, single], 1)):
+        for ask in (agent.predict, agent.value):
+            with pytest.raises(
+                ValueError, match=f"observation {row} holds {bad} at index 2; expected finite"
+            ):
+                ask(np.asarray(given, np.float32))
+
+
+@pytest.mark.parametrize("mask", [[-np.inf, 0.0], [0, 2], [0.5, 1.0], [np.nan, 1.0]])
+def test_a_mask_of_other_numbers_than_0_and_1(agent: tightrope.PPO, mask: list[float]) -> None:
+    """bool(-inf) is True: an additive mask would allow what it means to forbid."""
+    with pytest.raises(
+        ValueError, match="the action mask holds .*; expected True .1. where a choice is allowed"
+    ):
+        agent.predict(np.zeros(4, np.float32), action_masks=np.array(mask))
+
+
+@pytest.mark.parametrize("mask", [[True, False], [1, 0], [1.0, 0.0], np.array([1, 0], np.int8)])
+def test_a_mask_of_0_and_1_in_any_type(agent: tightrope.PPO, mask: Any) -> None:
+    assert agent.predict(np.zeros(4, np.float32), action_masks=mask)[0] == 0
+
+
+class Odd(gym.Env):
+    """Two numbers to see, one step long; what a step returns is given."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def __init__(
+        self, observation: Any = (0.0, 0.0), reward: Any = 0.0, ended: Any = True, mask: Any = None
+    ) -> None:
+        self.given = np.asarray(observation), reward, ended
+        self.mask, self.t = mask, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {} if self.mask is None else {"action_mask": np.ones(2, bool)}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        info = {} if self.mask is None else {"action_mask": np.asarray(self.mask)}
+        observation, reward, ended = self.given if self.t > 3 else (np.zeros(2, np.float32), 0.0, False)
+        return observation, reward, ended, False, info
+
+
+@pytest.mark.parametrize(
+    ("odd", "words"),
+    [
+        (
+            {"observation": [1 + 2j, 0], "ended": False},
+            "the observation is array.*expected an array of real numbers",
+        ),
+        (
+            {"observation": ["0.5", "1"], "ended": False},
+            "the observation is array.*expected an array of real numbers",
+        ),
+        ({"mask": [-np.inf, 0.0], "ended": False}, "the action mask holds -inf"),
+    ],
+)
+def test_what_numpy_would_store_as_another_number(odd: dict[str, Any], words: str) -> None:
+    """It comes late, when the first step has passed its checks."""
+    agent = tightrope.PPO(lambda: Odd(**odd), **SMALL)
+    with pytest.raises(EnvironmentFault, match=words):
+        agent.learn(64)
+
+
+def test_a_flag_that_is_neither_true_nor_false() -> None:
+    class Two(Odd):
+        def step(self, action: Any) -> Any:
+            return np.zeros(2, np.float32), 0.0, 2, False, {}
+
+    with pytest.raises(EnvironmentFault, match="terminated is 2, expected True or False"):
+        tightrope.PPO(Two, **SMALL).learn(64)
+
+
+def test_a_reward_beyond_float32() -> None:
+    with pytest.raises(BadNumbers, match=r"reward = 1e\+300 at step 3 .*at most 3.4e\+38"):
+        tightrope.PPO(lambda: Odd(reward=1e300), **SMALL).learn(64)
+
+
+# ------------------------------------------------------------------------------------------------ run folders
+
+
+@pytest.fixture
+def pole(tmp_path: Path) -> Path:
+    agent = tightrope.PPO("CartPole-v1", total_steps=64, evaluate_every=None, **SMALL)
+    train(agent.settings, run_dir=tmp_path / "pole")
+    return tmp_path / "pole"
+
+
+def test_a_budget_below_the_steps_that_are_done(pole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (pole / "settings.json").read_bytes()
+    with pytest.raises(
+        ValueError, match="has done 64 steps; expected total_steps of at least as many, got 32"
+    ):
+        resume(pole, total_steps=32)
+    assert main(["resume", str(pole), "--total-steps", "32"]) == 2
+    assert "has done 64 steps" in capsys.readouterr().err
+    assert (pole / "settings.json").read_bytes() == before
+
+
+class Named(gym.Env):
+    """A Dict observation under two names."""
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, *names: str, choices: int = 2) -> None:
+        self.observation_space = spaces.Dict({name: spaces.Box(-1, 1, (1,)) for name in names})
+        self.action_space = spaces.Discrete(choices)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        return self.observation_space.sample(), 0.0, True, False, {}
+
+
+def test_a_policy_is_not_loaded_for_other_spaces(tmp_path: Path) -> None:
+    agent = tightrope.PPO(lambda: Named("speed", "angle"), **SMALL)
+    agent.save(tmp_path / "saved")
+    tightrope.load(tmp_path / "saved", env=lambda: Named("speed", "angle")).close()
+    with pytest.raises(
+        ValueError, match=r"trained on observations \[\"Box\['angle'\].*here|has \[\"Box\['bb'\]"
+    ):
+        tightrope.load(tmp_path / "saved", env=lambda: Named("zz", "bb"))
+    with pytest.raises(
+        ValueError, match=r"trained on actions \['Discrete\[2\]'\]; this environment has \['Discrete\[3"
+    ):
+        tightrope.load(tmp_path / "saved", env=lambda: Named("speed", "angle", choices=3))
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"), [("sft", SFTSettings()), ("reward", RewardSettings()), ("align", AlignSettings())]
+)
+def test_a_run_of_another_command_is_named_with_what_reads_it(
+    tmp_path: Path, pole: Path, kind: str, settings: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A user who reads "damaged" may delete a good run."""
+    path = tmp_path / "run"
+    Run.create(path, settings.to_json(), kind).close()
+    words = f"is a run of tightrope {kind}, expected one of tightrope train. It is whole: use tightrope"
+    for read in (evaluate_run, tightrope.load, resume):
+        with pytest.raises(ValueError, match=words):
+            read(path)
+    assert main(["evaluate", str(path), "--json"]) == 2
+    assert words in capsys.readouterr().err
+    for read in (sample_run, resume_align, resume_sft):
+        with pytest.raises(
+            ValueError, match="is a run of tightrope train, expected one of tightrope (align|sft)"
+        ):
+            read(pole)
+    assert json.loads((path / "settings.json").read_text())
