@@ -13,9 +13,9 @@ from tightrope.language.data.batching import Example, collate, row_of
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import LOG_RATIO_LIMIT, LOWERED_LIMIT, draw, sample
 from tightrope.language.memory import Job, ledger, reward_model_bytes
-from tightrope.language.model import parts as parts_module
+from tightrope.language.model import architecture as parts_module
+from tightrope.language.model.architecture import attention_window, parts
 from tightrope.language.model.load import load_causal
-from tightrope.language.model.parts import attention_window, parts
 from tightrope.language.model.trunk import Trunk
 from tightrope.language.reward.model import load_reward
 from tightrope.language.supervised.sft import require_packable, token_loss

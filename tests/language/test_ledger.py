@@ -21,8 +21,8 @@ from tightrope.language.memory import (
     require_fit,
 )
 from tightrope.language.model import lora
+from tightrope.language.model.architecture import parts
 from tightrope.language.model.load import without_dropout
-from tightrope.language.model.parts import parts
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SFTSettings
 
 LLAMA = LlamaConfig(

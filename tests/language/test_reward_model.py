@@ -14,8 +14,8 @@ from tightrope.algorithms.descent import CheckedSteps
 from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Pair, preference_pairs
 from tightrope.language.model import lora
+from tightrope.language.model.architecture import parts
 from tightrope.language.model.load import load_causal
-from tightrope.language.model.parts import parts
 from tightrope.language.model.saving import load_adapter
 from tightrope.language.reward.model import SHIFT, RewardModel, last_real, load_reward
 from tightrope.language.settings import RewardSettings

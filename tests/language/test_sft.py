@@ -17,8 +17,8 @@ from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.language.data.batching import collate, pack_rows, row_of
 from tightrope.language.data.examples import hold_out
 from tightrope.language.model import lora
+from tightrope.language.model.architecture import parts
 from tightrope.language.model.load import load_causal, load_tokenizer
-from tightrope.language.model.parts import parts
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, micro_batches, take_step
 from tightrope.language.supervised.prepare import load_for_training

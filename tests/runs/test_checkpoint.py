@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from tightrope.control.environments.faults import EnvironmentFault
-from tightrope.runs import checkpoint, history, versions
+from tightrope.runs import checkpoint, retention, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY, CannotWrite, remove_leftovers, writing
 from tightrope.runs.tensors import safetensors_bytes
@@ -340,25 +340,25 @@ def test_newest_is_the_newest_valid_one(tmp_path: Path) -> None:
         checkpoint.save(checkpoint.step_folder(tmp_path, step), tensors(), {"step": step})
     (tmp_path / f"{TEMPORARY}step-000000002000-0").mkdir()
     (tmp_path / "step-99").mkdir()
-    assert history.valid(tmp_path).folder.name == "step-000000001000"
+    assert retention.valid(tmp_path).folder.name == "step-000000001000"
     flip_byte(tmp_path / "step-000000001000")
     with pytest.warns(UserWarning, match=r"passed over.*step-000000001000"):
-        assert history.valid(tmp_path).folder.name == "step-000000000900"
+        assert retention.valid(tmp_path).folder.name == "step-000000000900"
     told: list[str] = []
-    assert history.valid(tmp_path, told.append).state == {"step": 900}
+    assert retention.valid(tmp_path, told.append).state == {"step": 900}
     assert len(told) == 1 and "policy.safetensors" in told[0]
 
 
 def test_newest_without_a_valid_one(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no checkpoint"):
-        history.valid(tmp_path / "absent")
+        retention.valid(tmp_path / "absent")
     folder = checkpoint.save(checkpoint.step_folder(tmp_path, 1), tensors(), {})
     flip_byte(folder)
     with (
         pytest.warns(UserWarning, match="passed over"),
         pytest.raises(CheckpointError, match="no valid.*policy"),
     ):
-        history.valid(tmp_path)
+        retention.valid(tmp_path)
 
 
 def test_leftovers_of_a_crash_go_and_nothing_else(tmp_path: Path) -> None:

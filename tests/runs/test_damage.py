@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tightrope.runs import checkpoint, history
+from tightrope.runs import checkpoint, retention
 from tightrope.runs.checkpoint import CheckpointError
 
 ROUNDS = 2_000
@@ -34,7 +34,7 @@ def checkpoints(tmp_path: Path) -> Iterator[Path]:
 def used(checkpoints: Path) -> tuple[int, str]:
     """The step in use, and the messages about the others."""
     told: list[str] = []
-    point = history.valid(checkpoints, told.append)
+    point = retention.valid(checkpoints, told.append)
     assert point.state["step"] == checkpoint.step_of(point.folder)
     return point.state["step"], " ".join(told)
 
@@ -80,7 +80,7 @@ def test_files_swapped_between_steps_are_seen(checkpoints: Path, name: str) -> N
     assert name == "manifest.json" or name in told  # a valid manifest states another step
     old.write_bytes(content[1])
     with pytest.raises(CheckpointError, match="none of 2 can be used"):
-        history.valid(checkpoints, lambda text: None)
+        retention.valid(checkpoints, lambda text: None)
 
 
 def test_whole_folders_that_changed_places_are_seen(checkpoints: Path) -> None:
@@ -90,4 +90,4 @@ def test_whole_folders_that_changed_places_are_seen(checkpoints: Path) -> None:
     os.rename(new, checkpoints / "x")
     os.rename(old, new)
     with pytest.raises(CheckpointError, match=r"manifest\.json is of step 100"):
-        history.valid(checkpoints, lambda text: None)
+        retention.valid(checkpoints, lambda text: None)

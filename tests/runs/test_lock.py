@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tightrope.runs.history import valid
 from tightrope.runs.lock import NAME, RunInUse
+from tightrope.runs.retention import valid
 from tightrope.runs.run import Run
 
 WRITER = """

@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 import torch
 
-from tightrope.runs import checkpoint, history
+from tightrope.runs import checkpoint, retention
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.run import Run
 
 
 def steps(run: Run) -> list[int]:
-    return [checkpoint.step_of(folder) for folder in history.steps_in(run.checkpoints)]
+    return [checkpoint.step_of(folder) for folder in retention.steps_in(run.checkpoints)]
 
 
 def save(run: Run, step: int, told: list[str], **more: Any) -> None:
@@ -75,7 +75,7 @@ def test_a_save_that_fails_prunes_nothing(run: Run, monkeypatch: pytest.MonkeyPa
             else:
                 save(run, 30, told)
         assert steps(run) == [10, 20]
-        assert history.valid(run.checkpoints, told.append).state["step"] == 20
+        assert retention.valid(run.checkpoints, told.append).state["step"] == 20
     assert len(told) == 1 and told[0].startswith("No checkpoint at step 30")
     save(run, 30, told)
     save(run, 40, told)
@@ -106,7 +106,7 @@ def test_failures_at_random_never_cost_the_best_or_the_last(
         assert left[-len(saved[-2:]) :] == saved[-2:]
         best = max((step for step in merits), key=lambda step: merits[step], default=None)
         assert best is None or best in left
-        for folder in history.steps_in(run.checkpoints):
+        for folder in retention.steps_in(run.checkpoints):
             checkpoint.verify(folder)
     assert 5 < 59 - len(saved) < 40
 
@@ -121,7 +121,7 @@ def test_an_old_one_that_cannot_be_deleted_is_reported_and_is_no_failure(
     def refuse(folder: Path) -> None:
         raise PermissionError(13, "Permission denied", str(folder))
 
-    monkeypatch.setattr("tightrope.runs.history.remove", refuse)
+    monkeypatch.setattr("tightrope.runs.retention.remove", refuse)
     save(run, 30, told, final=True)
     assert len(told) == 1 and "cannot be deleted" in told[0] and "step-000000000010" in told[0]
     assert steps(run) == [10, 20, 30]
@@ -150,5 +150,5 @@ def test_a_reader_takes_the_newest_when_what_it_reads_is_replaced(
     if best:
         assert checkpoint.load(run.best)[1] == {"step": 2}
     else:
-        assert history.valid(run.checkpoints, lambda text: pytest.fail(text)).state["step"] == 40
+        assert retention.valid(run.checkpoints, lambda text: pytest.fail(text)).state["step"] == 40
     assert moments[0] > 2

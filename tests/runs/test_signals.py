@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tightrope.cli.training import farewell
+from tightrope.cli.train_commands import farewell
 from tightrope.runs import signals
 
 BOTH = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

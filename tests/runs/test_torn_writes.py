@@ -14,7 +14,7 @@ import pytest
 import torch
 from disk import Disk
 
-from tightrope.runs import checkpoint, durable, history
+from tightrope.runs import checkpoint, durable, retention
 from tightrope.runs.run import Run
 
 
@@ -37,11 +37,11 @@ def test_cut_anywhere_a_fresh_save_leaves_the_older_or_the_newer(
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)  # of the rebuilt folder
     found = []
     for count, lost, place in disk.states(tmp_path / "after"):
-        point = history.valid(place, silent)  # a torn one would be reported
+        point = retention.valid(place, silent)  # a torn one would be reported
         assert torch.equal(point.tensors["policy"]["w"], torch.full((5,), float(point.state["step"])))
         found.append((count, lost, point.state["step"]))
         durable.remove_leftovers(place)
-        assert history.valid(place, silent).state == point.state
+        assert retention.valid(place, silent).state == point.state
         assert not [p.name for p in place.iterdir() if p.name.startswith(".")]
     assert {step for _, _, step in found} == {100, 200}
     assert {step for count, _, step in found if count == len(disk.log)} == {200}  # returned: it is safe
@@ -62,7 +62,7 @@ def test_cut_anywhere_a_replacement_leaves_the_old_or_the_new(
     for count, lost, place in disk.states(tmp_path / "after"):
         found.append((count, lost, checkpoint.load(place / name)[1]["version"]))
         if name != "best":
-            assert history.valid(place, silent).state["version"] == found[-1][2]
+            assert retention.valid(place, silent).state["version"] == found[-1][2]
         durable.remove_leftovers(place)
         assert checkpoint.load(place / name)[1]["version"] == found[-1][2]
         assert [p.name for p in place.iterdir()] == [name]
@@ -95,7 +95,7 @@ def test_cut_anywhere_a_run_continues_with_no_row_twice_and_none_missing(
             run.rewind(point)
             step = point.state["step"]
             assert [(place / n).read_bytes() for n in ("metrics.jsonl", "episodes.jsonl")] == rows[step]
-        assert len(history.steps_in(place / "checkpoints")) >= 2
+        assert len(retention.steps_in(place / "checkpoints")) >= 2
         last = step if (count, lost) == (len(disk.log), "names") else last
     assert last == 40
 
@@ -114,6 +114,6 @@ def test_the_disk_of_these_tests_loses_what_is_not_synced(
     disk.log = [entry for entry in disk.log if entry[0] != "fsync"]
     torn = []
     for _, lost, place in disk.states(tmp_path / "after"):
-        history.valid(place, lambda text, lost=lost: torn.append(lost))
+        retention.valid(place, lambda text, lost=lost: torn.append(lost))
     assert {"bytes", "half of the bytes"} <= set(torn)
     shutil.rmtree(root)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.algorithms.batch import Batch, Evaluation
-from tightrope.algorithms.memory import MicroBatches
+from tightrope.algorithms.micro_batches import MicroBatches
 from tightrope.algorithms.nonfinite import REFUSED, NonFiniteError, explain
 from tightrope.algorithms.settings import UpdateSettings
 from tightrope.errors import TightropeError

@@ -23,7 +23,7 @@ from tightrope.cli.options import (
     record_parser,
     sample_parser,
 )
-from tightrope.cli.training import require_transformers, resume, train
+from tightrope.cli.train_commands import require_transformers, resume, train
 from tightrope.errors import TightropeError
 from tightrope.runs.records import printable
 

@@ -198,7 +198,7 @@ class Agent:
         """The critic's V(s) in units of the return: a float for one observation, an array [N] for a batch."""
         layout = self.environments.observation_layout
         batched = _is_batched(layout, observation)
-        inputs = self.normalisers.encode(finite(layout.encode(observation, batched=batched)))
+        inputs = self.normalisers.encode(require_finite(layout.encode(observation, batched=batched)))
         values = self.policy.values(inputs).cpu().numpy()
         if self.normalisers.rewards is not None:
             values = values * self.normalisers.rewards.deviation
@@ -210,7 +210,7 @@ class Agent:
         """Action matrix [N, A] for observations as their layout encodes them: sampled with ``rng``, without
         it the most likely actions. ``action_mask`` bool [N, L].
         """
-        inputs = self.normalisers.encode(finite(inputs))
+        inputs = self.normalisers.encode(require_finite(inputs))
         if action_mask is not None:
             inputs = {**inputs, "action_mask": action_mask}
         if rng is None:
@@ -406,7 +406,7 @@ def _normalisers(environments: Environments, settings: TrainSettings) -> Normali
     return Normalisers(observations, rewards)
 
 
-def finite(inputs: Inputs) -> Inputs:
+def require_finite(inputs: Inputs) -> Inputs:
     """The inputs as they are. ValueError for a NaN or an infinity, from which any action could follow."""
     good = np.isfinite(inputs["flat"]) if "flat" in inputs else np.True_
     if not good.all():

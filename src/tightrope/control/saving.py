@@ -13,8 +13,8 @@ from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
 from tightrope.runs.folders import require_kind
-from tightrope.runs.history import Checkpoint
 from tightrope.runs.records import retyped
+from tightrope.runs.retention import Checkpoint
 
 
 def load(

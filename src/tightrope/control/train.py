@@ -18,7 +18,7 @@ from tightrope.runs import signals
 from tightrope.runs.checkpoint import step_of, understood
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.folders import require_kind
-from tightrope.runs.history import Checkpoint
+from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.training import loop
 from tightrope.training.events import Listener, Listeners

@@ -26,8 +26,8 @@ from torch import Tensor, nn
 
 from tightrope.errors import TightropeError
 from tightrope.language.generation.distribution import CHUNK
+from tightrope.language.model.architecture import Parts, parts
 from tightrope.language.model.load import fused, pretrained, without_weights
-from tightrope.language.model.parts import Parts, parts
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SupervisedSettings
 
 Phase = Literal["always", "rollout", "update"]

@@ -10,11 +10,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from tightrope.metrics import table as metrics
-from tightrope.runs import checkpoint, durable, history, signals, versions
+from tightrope.runs import checkpoint, durable, retention, signals, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import CannotWrite, sync_folder, writing
 from tightrope.runs.folders import fresh, require_free, why_not
-from tightrope.runs.history import Checkpoint, marks_of
 from tightrope.runs.lock import WriterLock
 from tightrope.runs.records import (
     RECORDS,
@@ -27,6 +26,7 @@ from tightrope.runs.records import (
     refuse_links,
     write_json,
 )
+from tightrope.runs.retention import Checkpoint, marks_of
 from tightrope.runs.signed import read_settings, signed
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ class Run:
         """Read the newest valid checkpoint, without the lock. Damaged ones are skipped with a
         warning. Raises CheckpointError.
         """
-        return history.valid(self.checkpoints)
+        return retention.valid(self.checkpoints)
 
     def record(self, step: int, seconds: float, values: dict[str, float]) -> dict[str, float]:
         """Append the metrics of one update, and the cost of the checkpoint before it; returns both. Every
@@ -217,7 +217,7 @@ class Run:
             warn(f"No checkpoint at step {step:,}: {error.what} {error.advice}. Training continues.")
             return
         try:
-            history.prune(self.checkpoints, keep)
+            retention.prune(self.checkpoints, keep)
         except OSError as error:
             warn(f"An old checkpoint cannot be deleted: {error}. Check {self.checkpoints}.")
         size = sum(path.stat().st_size for path in folder.iterdir())
@@ -254,7 +254,7 @@ class Run:
         if self._lock.left_by:
             info(f"the run was left without an end by {self._lock.left_by}")
         self._put_aside_a_damaged_best(warn)
-        point = history.valid(self.checkpoints, warn, self._check_records)
+        point = retention.valid(self.checkpoints, warn, self._check_records)
         manifest = checkpoint.read_manifest(durable.present(point.folder))
         if changed := versions.version_changes(manifest.get("versions")):
             warn(f"{changed} since the checkpoint: the run continues, but its last bits may differ.")
@@ -289,7 +289,7 @@ class Run:
         self._close_files()
         with writing(self.path):
             self._clean()
-            for folder in history.steps_in(self.checkpoints):
+            for folder in retention.steps_in(self.checkpoints):
                 if checkpoint.step_of(folder) > (-1 if point is None else checkpoint.step_of(point.folder)):
                     durable.put(folder, folder.with_name(f"unusable-{folder.name}"))
             marks = {} if point is None else marks_of(point)

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_ty
 
 Schedule = Literal["constant", "linear", "cosine"]
 SCHEDULES = get_args(Schedule)
-LARGEST = 2**63 - 1  # whole numbers beyond it fit neither torch nor numpy
+LARGEST_INTEGER = 2**63 - 1  # whole numbers beyond it fit neither torch nor numpy
 
 
 def setting(
@@ -92,9 +92,9 @@ def typed(name: str, value: Any, kind: Kind) -> Any:
         return None
     if kind.type is tuple and isinstance(value, list | tuple) and all(type(x) is int for x in value):
         return tuple(typed(name, x, Kind(int, False)) for x in value)
-    if type(value) is int and abs(value) > LARGEST:
+    if type(value) is int and abs(value) > LARGEST_INTEGER:
         digits = str(value) if abs(value) < 10**30 else "a number of more than 30 digits"
-        raise ValueError(f"{name} is {digits}; expected at most {LARGEST} (64 bits).")
+        raise ValueError(f"{name} is {digits}; expected at most {LARGEST_INTEGER} (64 bits).")
     if kind.type is float and type(value) is int:
         return float(value)
     if type(value) is kind.type or dataclasses.is_dataclass(kind.type):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from tightrope.runs.history import Checkpoint
+from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.training.parameters import Tensors
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tightrope.runs.checkpoint import understood
-from tightrope.runs.history import Checkpoint, steps_in
+from tightrope.runs.retention import Checkpoint, steps_in
 from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Learner, change

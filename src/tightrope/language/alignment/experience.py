@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms.batch import Batch
-from tightrope.algorithms.memory import OutOfMemory, free, is_out_of_memory
+from tightrope.algorithms.micro_batches import OutOfMemory, free, is_out_of_memory
 from tightrope.language.alignment.kl import kl_rewards
 from tightrope.language.data.batching import length_groups, pad_left
 from tightrope.language.data.examples import Prompt

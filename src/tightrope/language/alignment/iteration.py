@@ -31,8 +31,8 @@ from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.alignment.samples import sample_rows
 from tightrope.language.data.examples import Prompt, hold_out_prompts, read_prompts, read_rows
 from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.model.architecture import context_length
 from tightrope.language.model.packaged import find_model
-from tightrope.language.model.parts import context_length
 from tightrope.language.model.saving import save_model
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
@@ -50,8 +50,8 @@ from tightrope.language.reward.judge import (
 from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.maths.values import explained_variance
 from tightrope.runs.checkpoint import understood
-from tightrope.runs.history import Checkpoint
 from tightrope.runs.records import figures
+from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Update, crosses

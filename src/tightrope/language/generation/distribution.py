@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.parts import FACTOR
+from tightrope.language.model.architecture import FACTOR
 
 CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 

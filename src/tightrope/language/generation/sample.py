@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
 from tightrope.language.generation.distribution import Sampling, next_logits
-from tightrope.language.model.parts import parts
+from tightrope.language.model.architecture import parts
 
 # A forward pass takes its cache under the old name up to transformers 5.23. From 5.24 on the name is new, and
 # the old one warns at every step. Models outside transformers may keep the old name.

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.parts import parts
+from tightrope.language.model.architecture import parts
 from tightrope.runs.records import each_key_once
 
 # every file of a model folder in which transformers looks for the names of code

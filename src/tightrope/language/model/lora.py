@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.parts import parts
+from tightrope.language.model.architecture import parts
 
 
 class Switch:

@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from tightrope.language.model.architecture import parts
 from tightrope.language.model.load import read_object, read_tensors
 from tightrope.language.model.lora import (
     Adapted,
@@ -16,7 +17,6 @@ from tightrope.language.model.lora import (
     load_adapter_state,
     merged_state,
 )
-from tightrope.language.model.parts import parts
 from tightrope.runs.durable import atomic_folder, writing
 
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
 from tightrope.language.model import lora
-from tightrope.language.model.parts import WINDOW_FIELDS, parts
+from tightrope.language.model.architecture import WINDOW_FIELDS, parts
 
 FINAL_NORMS = ("norm", "ln_f", "final_layer_norm")
 NARROW = 3  # tokens of a window while the halves are tried

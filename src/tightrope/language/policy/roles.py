@@ -21,9 +21,9 @@ from torch import nn
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.memory import job_of, require_memory, reward_model_bytes
 from tightrope.language.model import lora
+from tightrope.language.model.architecture import parameter_counts, parts
 from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, require_device
 from tightrope.language.model.packaged import find_model
-from tightrope.language.model.parts import parameter_counts, parts
 from tightrope.language.model.saving import load_adapter
 from tightrope.language.model.trunk import Role, Trunk
 from tightrope.language.settings import AlignSettings

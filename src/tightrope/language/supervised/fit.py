@@ -18,14 +18,14 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.algorithms.descent import CheckedSteps
-from tightrope.algorithms.memory import MicroBatches
+from tightrope.algorithms.micro_batches import MicroBatches
 from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam
 from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs.checkpoint import understood
-from tightrope.runs.history import Checkpoint
 from tightrope.runs.records import figures
+from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.settings.fields import scheduled
 from tightrope.training.learner import Update, crosses

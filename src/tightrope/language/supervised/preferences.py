@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from tightrope.language.data.batching import pad_right
 from tightrope.language.data.examples import Pair, preference_pairs, read_rows, sft_examples
-from tightrope.language.model.parts import parts
+from tightrope.language.model.architecture import parts
 from tightrope.language.reward.model import RewardModel
 from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised.fit import Objective, micro_batches

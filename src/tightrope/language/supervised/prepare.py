@@ -12,6 +12,7 @@ from torch import nn
 from tightrope.language.data.examples import Item, Row, hold_out, read_rows
 from tightrope.language.memory import job_of, require_memory
 from tightrope.language.model import lora
+from tightrope.language.model.architecture import context_length
 from tightrope.language.model.load import (
     eos_ids,
     load_causal,
@@ -21,7 +22,6 @@ from tightrope.language.model.load import (
     without_dropout,
 )
 from tightrope.language.model.packaged import find_model
-from tightrope.language.model.parts import context_length
 from tightrope.language.settings import SupervisedSettings
 from tightrope.runs import signals
 from tightrope.training.events import Listeners

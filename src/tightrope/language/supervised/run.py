@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tightrope.language.model.parts import parameter_counts
+from tightrope.language.model.architecture import parameter_counts
 from tightrope.language.quiet import quiet_libraries
 from tightrope.language.settings import SupervisedSettings, recorded
 from tightrope.language.supervised.fit import Objective, SupervisedLearner

@@ -15,7 +15,7 @@ from torch import Tensor
 from tightrope.language.data.batching import Example, Packed, attention_of, collate, pack_rows, row_of
 from tightrope.language.data.examples import Row, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
-from tightrope.language.model.parts import attention_window, parts
+from tightrope.language.model.architecture import attention_window, parts
 from tightrope.language.model.saving import save_model
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, micro_batches
