@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -223,3 +225,96 @@ def test_a_run_of_another_command_is_named_with_what_reads_it(
         ):
             read(pole)
     assert json.loads((path / "settings.json").read_text())
+
+
+# ------------------------------------------------------------------------------------------ the command line
+
+TASKS = """
+import os
+import gymnasium as gym, numpy as np
+
+class Task(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Discrete(2)
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, True, False, {}
+
+class Constructor(Task):
+    def __init__(self, **_):
+        raise KeyError("asset")
+
+class Close(Task):
+    def close(self):
+        raise OSError("it broke")
+
+class Prints(Task):
+    def step(self, action):
+        print("from Python")
+        os.write(1, b"from C\\n")
+        return super().step(action)
+
+for kind in (Constructor, Close, Prints):
+    gym.register(f"refused/{kind.__name__}-v0", entry_point=kind, max_episode_steps=10)
+"""
+
+
+def command(folder: Path, task: str, *more: str) -> subprocess.CompletedProcess[str]:
+    """``tightrope train`` on one of TASKS, in a process of its own."""
+    (folder / "tasks.py").write_text(TASKS)
+    small = ["--total-steps", "64", "--num-steps", "16", "--minibatch-size", "16", "--evaluate-every", "none"]
+    words = ["train", f"refused/{task}-v0", "--env-module", "tasks.py", *small, "--engine", "torch", *more]
+    return subprocess.run(
+        [sys.executable, "-m", "tightrope", *words], cwd=folder, capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.mark.parametrize("backend", ["serial", "workers"])
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        ("Constructor", "Making environment 0 raised KeyError: 'asset'"),
+        ("Close", "Closing environment 0 raised OSError"),
+    ],
+)
+def test_code_of_a_task_that_raises_outside_its_episodes(
+    tmp_path: Path, task: str, words: str, backend: str
+) -> None:
+    ended = command(tmp_path, task, "--vector-backend", backend)
+    assert ended.returncode == 2
+    assert f"tightrope: {words}" in ended.stderr
+    assert 'File "' in ended.stderr  # where, in the task's own code
+
+
+@pytest.mark.parametrize("backend", ["serial", "workers"])
+def test_what_a_task_prints_does_not_reach_the_json(tmp_path: Path, backend: str) -> None:
+    ended = command(tmp_path, "Prints", "--vector-backend", backend, "--json")
+    assert (ended.returncode, json.loads(ended.stdout)["steps"]) == (0, 64), ended.stderr
+    assert "from Python" in ended.stderr
+    assert "from C" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--env-module", ""], "--env-module is empty"),
+        (["--settings", ""], "--settings is empty"),
+        (["--run-dir", ""], "run_dir is empty"),
+        (["--num-envs", "1e308", "--dry-run"], "num_envs is a number of more than 30 digits"),
+        (["--env-timeout", "1e308"], r"env_timeout is 1e+308; expected 0 < x <= 1e+09"),
+        (["--adam-eps", "1e308"], "adam_eps is 1e+308; expected 0 < x <= 1"),
+    ],
+)
+def test_empty_words_and_numbers_without_a_meaning(
+    flags: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "CartPole-v1", "--total-steps", "64", "--engine", "torch", *flags]) == 2
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

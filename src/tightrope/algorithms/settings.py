@@ -38,7 +38,7 @@ class UpdateSettings(Settings):
         "linear", "How both learning rates fall over the run.", choices=SCHEDULES
     )
     adam_eps: float = setting(
-        1e-5, "Adam's epsilon; 1e-5 is PPO's habit, torch's own default is 1e-8.", above=0
+        1e-5, "Adam's epsilon; 1e-5 is PPO's habit, torch's own default is 1e-8.", above=0, at_most=1
     )
     max_grad_norm: float | None = setting(
         0.5, "One joint limit on the norm of all gradients; none: gradients are not clipped.", above=0

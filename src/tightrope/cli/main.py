@@ -22,6 +22,7 @@ from tightrope.cli.options import (
     print_json,
     record_parser,
     sample_parser,
+    stdout_for_json,
 )
 from tightrope.cli.train_commands import require_transformers, resume, train
 from tightrope.errors import TightropeError
@@ -193,7 +194,8 @@ def main(words: list[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            return _dispatch(words)
+            with stdout_for_json(words):
+                return _dispatch(words)
     except (TightropeError, ValueError, OSError, RuntimeError, FloatingPointError) as error:
         if isinstance(error, BrokenPipeError):
             # the reader of our output is gone; Python must not flush to it at exit

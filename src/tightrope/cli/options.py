@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import importlib.util
 import json
 import os
 import shlex
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from tightrope.cli.flags import (
     Parser,
@@ -82,11 +83,49 @@ DESCRIPTIONS: dict[str, tuple[str, str, str | None]] = {
 }
 
 
+_json_stream: TextIO | None = None  # where --json goes while standard output is kept for it
+
+
 def print_json(value: dict[str, Any]) -> None:
     """Print a line of JSON to standard output, for --json; numbers that JSON cannot hold become null."""
     from tightrope.runs.records import dumps
 
-    print(dumps(value), flush=True)
+    print(dumps(value), file=_json_stream or sys.stdout, flush=True)
+
+
+@contextlib.contextmanager
+def stdout_for_json(words: list[str]) -> Iterator[None]:
+    """With --json, what anything else prints to standard output goes to standard error: a line of an
+    environment or a reward function must not break the JSON. The file descriptor too: C code and worker
+    processes write there.
+    """
+    global _json_stream
+    if "--json" not in words:
+        yield
+        return
+    out, descriptor = sys.stdout, _descriptor(sys.stdout)
+    try:
+        if descriptor is None or _descriptor(sys.stderr) is None:
+            _json_stream = out
+        else:
+            out.flush()
+            _json_stream = os.fdopen(os.dup(descriptor), "w", encoding="utf-8", errors="replace")
+            os.dup2(sys.stderr.fileno(), descriptor)
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        if _json_stream is not None and _json_stream is not out:
+            os.dup2(_json_stream.fileno(), out.fileno())
+            with contextlib.suppress(OSError):  # the reader is gone, which print_json has reported
+                _json_stream.close()
+        _json_stream = None
+
+
+def _descriptor(stream: TextIO) -> int | None:
+    try:
+        return stream.fileno()
+    except (AttributeError, OSError, ValueError):  # replaced by one that has none, as in a test
+        return None
 
 
 def _output(parser: Parser) -> None:
@@ -101,7 +140,10 @@ def _output(parser: Parser) -> None:
 def dry_run(settings: Settings, given: Options) -> bool:
     """Whether --dry-run was given; then the settings are printed."""
     if given.get("dry_run"):
-        print(json.dumps(settings.to_json(), indent=None if given.get("json") else 2))
+        if given.get("json"):
+            print_json(settings.to_json())
+        else:
+            print(json.dumps(settings.to_json(), indent=2))
     return bool(given.get("dry_run"))
 
 
@@ -302,7 +344,7 @@ def training_options(command: str, words: list[str]) -> tuple[Options, Options]:
     """
     words = [with_dashes(word) for word in words]
     path = _value_of("--settings", words)
-    of_file = _values_of_file(command, path) if path else {}
+    of_file = {} if path is None else _values_of_file(command, path)
     algorithm = "ppo"
     if command == "train":
         algorithm = _value_of("--algorithm", words) or of_file.get("algorithm", "ppo")
@@ -358,6 +400,8 @@ def _settings_in(path: str) -> Any:
     from tightrope.runs.records import read_json
     from tightrope.runs.signed import unsigned
 
+    if not path:
+        raise UsageError("--settings is empty. Give RUN/settings.json.")
     file = Path(path)
     file = file / "settings.json" if file.is_dir() else file
     if not file.is_file():
@@ -398,6 +442,8 @@ def import_env_module(given: Options) -> None:
     name = given.get("env_module")
     if name is None:
         return
+    if not name:
+        raise UsageError("--env-module is empty. Give a module or FILE.py.")
 
     path = Path(name)
     if path.suffix != ".py":

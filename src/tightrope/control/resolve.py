@@ -37,7 +37,7 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
     if limit is not None and "checkpoint_every" not in values:
         total = {"total_steps": TrainSettings.total_steps, **merged}["total_steps"]
         if type(total) is int and total > 0 and type(sizes[0]) is int:
-            chosen["checkpoint_every"] = _checkpoint_interval(limit * sizes[0] / total)
+            chosen["checkpoint_every"] = _checkpoint_interval(limit * min(sizes[0], total) / total)
     return TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
 
 
@@ -52,6 +52,7 @@ def _checkpoint_interval(episode: float) -> float:
 
 def _describe(env: Any) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
+    from tightrope.control.environments.faults import close_environment
     from tightrope.control.environments.tasks import make_all, make_vector_by_id, makers_of, time_limit
     from tightrope.control.spaces import action_layout, observation_layout
 
@@ -60,7 +61,10 @@ def _describe(env: Any) -> tuple[str, int | None]:
         made.append(make_vector_by_id(env, 1))
     elif not hasattr(env, "observation_space"):
         make_all(makers_of(env, 1), made)
-    with contextlib.closing(made[0]) if made else contextlib.nullcontext(env) as task:
+    with contextlib.ExitStack() as stack:
+        if made:
+            stack.callback(close_environment, made[0], 0)
+        task = made[0] if made else env
         vector = hasattr(task, "single_observation_space")
         observations = observation_layout(task.single_observation_space if vector else task.observation_space)
         actions = action_layout(task.single_action_space if vector else task.action_space)

@@ -95,6 +95,7 @@ class TrainSettings(Settings):
         60.0,
         "Seconds a step or a reset of an environment may take before it counts as hung; none: no limit.",
         above=0,
+        at_most=1e9,
     )
 
     evaluate_every: float | None = setting(

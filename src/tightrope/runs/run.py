@@ -55,6 +55,8 @@ class Run:
         ``run_dir`` None: ``runs/<name>-<yyyymmdd-hhmmss>``. Nothing is ever overwritten: a folder that exists
         and is not empty raises ValueError before anything is written.
         """
+        if run_dir == "":
+            raise ValueError("run_dir is empty. Give the path of a new folder, or leave it out.")
         with writing(Path("runs") if run_dir is None else Path(run_dir)):
             if run_dir is None:
                 path = fresh(Path("runs"), re.sub(r"[^\w.-]+", "-", name))

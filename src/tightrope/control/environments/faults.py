@@ -177,6 +177,22 @@ def explained(
     return fault
 
 
+def fault_while(doing: str, index: int, error: BaseException) -> EnvironmentFault:
+    """The fault for an error of an environment's own code in its constructor or in ``close``."""
+    what = "".join(traceback.format_exception(error)).rstrip()
+    return EnvironmentFault(
+        f"{doing} environment {index} raised {type(error).__name__}: {error}. Mend it there.\n{what}", index
+    )
+
+
+def close_environment(env: Any, index: int) -> None:
+    """Close an environment; EnvironmentFault when its own code raises."""
+    try:
+        env.close()
+    except RAISED as error:
+        raise fault_while("Closing", index, error) from error
+
+
 def circumstances(worker: int, seed: int | None, action: str | None) -> str:
     """`` (worker 2, seed 7, last action 1)``."""
     who = f"worker {worker}" if worker else "in this process"

@@ -29,6 +29,7 @@ from tightrope.control.environments.faults import (
     EnvironmentFault,
     FaultPolicy,
     action_text,
+    close_environment,
     seed_of,
     wait_before_restart,
 )
@@ -110,7 +111,8 @@ class EnvironmentPool(Environments):
                 worker.wait()
         except BaseException:
             self._stop_workers()
-            self._close_all(envs)
+            with contextlib.suppress(EnvironmentFault):
+                self._close_all(envs)
             raise
         if policy.timeout is not None and self._group is not None:
             self._watchdog = Watchdog(self._group.call_number, policy.timeout, f"An environment ({name})")
@@ -311,12 +313,19 @@ class EnvironmentPool(Environments):
             self._watchdog.stop()
         self._stop_workers()
         if self._group is not None:
-            self._close_all(self._group.envs)
-            self._group.envs = []
+            envs, self._group.envs = self._group.envs, []
+            self._close_all(envs)
 
     def _close_all(self, envs: Sequence[gym.Env]) -> None:
-        for env in envs[self._keep :]:
-            env.close()
+        """Close all; EnvironmentFault for the first that raised."""
+        first: EnvironmentFault | None = None
+        for index in range(self._keep, len(envs)):
+            try:
+                close_environment(envs[index], index)
+            except EnvironmentFault as fault:
+                first = first or fault
+        if first is not None:
+            raise first
 
     def _stop_workers(self) -> None:
         for worker in self._workers:
@@ -348,7 +357,7 @@ def _serve(
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     envs: list[gym.Env] = []
     try:
-        make_all(makers.fn, envs)
+        make_all(makers.fn, envs, first)
         buffers = shared.map(SharedArray.view).map(lambda array: array[first : first + len(envs)])
         group = EnvGroup(envs, buffers, name, first, makers=makers.fn, policy=policy, worker=number)
         envs = group.envs

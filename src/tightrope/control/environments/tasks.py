@@ -15,6 +15,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
+from tightrope.control.environments.faults import RAISED, fault_while, raised_here
 from tightrope.control.spaces import (
     ActionLayout,
     ObservationLayout,
@@ -226,13 +227,19 @@ def makers_of(env: Any, num_envs: int) -> list[Callable[[], gym.Env]]:
     )
 
 
-def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env]) -> None:
-    """Append one environment per maker to ``envs``.
+def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env], first: int = 0) -> None:
+    """Append one environment per maker to ``envs``; ``first``: the number of the first in the run.
 
-    ValueError when a maker returns something else, or the same object twice.
+    ValueError when a maker returns something else, or the same object twice. EnvironmentFault when the
+    environment's own code raises.
     """
     for maker in makers:
-        env = maker()
+        try:
+            env = maker()
+        except RAISED as error:
+            if raised_here(error):
+                raise
+            raise fault_while("Making", first + len(envs), error) from error
         if not isinstance(env, gym.Env):
             raise ValueError(f"the factory returned a {type(env).__name__}; expected a gymnasium.Env.")
         if any(env is other for other in envs):
