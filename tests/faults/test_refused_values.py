@@ -23,7 +23,9 @@ from tightrope.language.alignment.align import resume_align
 from tightrope.language.compare import sample_run
 from tightrope.language.settings import AlignSettings, RewardSettings, SFTSettings
 from tightrope.language.supervised.sft import resume_sft
+from tightrope.runs.durable import CannotWrite
 from tightrope.runs.run import Run
+from tightrope.training.events import Updated
 
 SMALL: dict[str, Any] = {
     "num_envs": 2,
@@ -171,6 +173,27 @@ def test_a_budget_below_the_steps_that_are_done(pole: Path, capsys: pytest.Captu
     assert main(["resume", str(pole), "--total-steps", "32"]) == 2
     assert "has done 64 steps" in capsys.readouterr().err
     assert (pole / "settings.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("every", [None, 0.5])
+def test_a_run_folder_that_goes_away_ends_the_run_and_is_not_made_again(
+    tmp_path: Path, every: float | None
+) -> None:
+    agent = tightrope.PPO(
+        "CartPole-v1", total_steps=128, evaluate_every=every, checkpoint_every=None, **SMALL
+    )
+    path, moved = tmp_path / "pole", tmp_path / "elsewhere"
+
+    def rename(event: Any) -> None:
+        if isinstance(event, Updated) and path.exists():
+            path.rename(moved)
+
+    with pytest.raises(
+        CannotWrite, match="pole cannot be written .the run folder is gone.*give it its name back"
+    ):
+        train(agent.settings, run_dir=path, listeners=[rename])
+    assert not path.exists()
+    assert (moved / "metrics.jsonl").stat().st_size > 0
 
 
 class Named(gym.Env):

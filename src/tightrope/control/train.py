@@ -213,6 +213,7 @@ class AgentLearner:
 
     def _keep(self, mean: float) -> None:
         """Save the policy as the best. If it cannot be written, the one before stays the best."""
+        self.run.require_there()
         try:
             with signals.uninterrupted():
                 self.agent.save(self.run.best)

@@ -30,6 +30,7 @@ _ADVICE = {
     errno.EFBIG: _FULL,
     errno.EROFS: "The disk is read-only: have it mounted for writing",
     errno.EACCES: "Give yourself the permission to write there",
+    errno.ENOENT: "If it was renamed, give it its name back",
     errno.EPERM: "Give yourself the permission to write there",
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import time
 from collections.abc import Callable, Iterable
@@ -206,6 +207,7 @@ class Run:
         final: bool,
     ) -> None:
         self.lock()
+        self.require_there()
         folder, clock = self.checkpoint_folder(step), time.perf_counter()
         try:
             with writing(folder):
@@ -225,6 +227,11 @@ class Run:
         size = sum(path.stat().st_size for path in folder.iterdir())
         seconds = time.perf_counter() - clock
         self._costs = {"time/checkpoint_seconds": seconds, "time/checkpoint_megabytes": size / 1e6}
+
+    def require_there(self) -> None:
+        """CannotWrite when the folder was deleted or renamed: a save would make a part of it again."""
+        if not (self.path / "settings.json").is_file():
+            raise CannotWrite(self.path, FileNotFoundError(errno.ENOENT, "the run folder is gone"))
 
     def _sync(self) -> dict[str, Any]:
         """Make all records durable; returns the marks of the files."""
