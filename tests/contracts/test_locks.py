@@ -124,10 +124,18 @@ def test_ranges_are_open_and_the_oldest_lock_holds_their_lower_ends():
         assert held.release[:known] == lower.release, f"{requirement}: test-oldest runs with {held}"
 
 
+@pytest.mark.parametrize("name", ["ruff", "mypy"])
+def test_a_checker_is_held_by_make_check(name):
+    """Its verdict is known for the version of the lock only, so that is the lower end of its range."""
+    lower = next(iter(next(r for r in ranges() if r.name == name).specifier)).version
+    assert lower == str(locked_here("test")[name])
+
+
 def test_both_ends_of_the_ranges_are_tested_without_the_lock_of_every_day():
     recipe = re.search(r"^test-newest test-oldest: .*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE)
     assert recipe is not None
     assert "$(CONSTRAINT_$*)" in recipe[1]
+    assert "--editable '.[dev,envpool]'" in recipe[1]  # every extra: dev names the others
     assert re.findall(r"^CONSTRAINT_(\w+) := (.*)$", MAKEFILE, re.MULTILINE) == [
         ("oldest", "--constraint locks/oldest.txt")
     ]

@@ -168,7 +168,7 @@ def test_a_model_in_memory_is_given_again(tmp_path, stage):
 
 def test_a_run_of_another_command_is_named(tmp_path, folder):
     train_sft(SFTSettings(model=folder, **FAST), data=FACTS, run_dir=tmp_path / "run")
-    with pytest.raises(ValueError, match="RewardSettings has no setting named 'on_completions'"):
+    with pytest.raises(ValueError, match="is a run of tightrope sft, expected one of tightrope reward"):
         resume_reward(tmp_path / "run", data=FACTS)
     with pytest.raises(ValueError, match="not a run folder"):
         resume_sft(tmp_path / "absent")
