@@ -191,7 +191,7 @@ def test_copies_that_fail_to_build_in_a_worker_close_the_others():
         built.append(chain.Chain())
         return built[0]
 
-    with pytest.raises(EnvironmentFault, match="in a worker failed: OSError: only one licence"):
+    with pytest.raises(EnvironmentFault, match="Making environment 1 raised OSError: only one licence"):
         make_environments(factory, 2, backend="workers", num_workers=2)
     assert built[0].closed
 
