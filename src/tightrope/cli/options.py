@@ -26,7 +26,7 @@ from tightrope.cli.flags import (
 )
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 from tightrope.language.settings import RECIPES, AlignSettings, ModelSettings, RewardSettings, SFTSettings
-from tightrope.runs.folders import OWN_FIELDS
+from tightrope.runs.folders import command_of
 from tightrope.runs.records import retyped
 from tightrope.settings.values import Settings, rule_of
 
@@ -114,8 +114,8 @@ def stdout_for_json(words: list[str]) -> Iterator[None]:
         with contextlib.redirect_stdout(sys.stderr):
             yield
     finally:
-        if _json_stream is not None and _json_stream is not out:
-            os.dup2(_json_stream.fileno(), out.fileno())
+        if descriptor is not None and _json_stream is not None and _json_stream is not out:
+            os.dup2(_json_stream.fileno(), descriptor)
             with contextlib.suppress(OSError):  # the reader is gone, which print_json has reported
                 _json_stream.close()
         _json_stream = None
@@ -413,8 +413,7 @@ def _settings_in(path: str) -> Any:
 def _values_of_file(command: str, path: str) -> Options:
     """The values in a settings file, names and types checked. UsageError for those of another command."""
     data = _settings_in(path)
-    fields = data if isinstance(data, dict) else {}
-    other = next((name for name, field in OWN_FIELDS.items() if field in fields), command)
+    other = (command_of(data) if isinstance(data, dict) else None) or command
     if other != command:
         raise UsageError(
             f"--settings {path} holds the settings of {other}, expected those of {command}. Give "

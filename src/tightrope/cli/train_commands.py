@@ -25,7 +25,7 @@ from tightrope.cli.options import (
     training_options,
 )
 from tightrope.runs import checkpoint, signals
-from tightrope.runs.folders import OWN_FIELDS
+from tightrope.runs.folders import command_of
 from tightrope.runs.run import Run
 from tightrope.settings.values import Settings
 
@@ -69,7 +69,7 @@ def resume(words: list[str]) -> int:
     except ValueError:  # who writes there now comes first: RunInUse
         with Run.open(given["run"], own=True) as run:
             settings = run.settings
-    command = next((name for name in ("train", "sft", "reward") if OWN_FIELDS[name] in settings), "align")
+    command = command_of(settings) or "align"
     total = given.get("total_steps")
     if command == "train":
         import_env_module(given)

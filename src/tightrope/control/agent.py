@@ -24,7 +24,7 @@ from tightrope.algorithms.settings import PPOSettings, UpdateSettings
 from tightrope.control.engine.base import limited_threads
 from tightrope.control.engine.choose import choose_engine, usable_device
 from tightrope.control.environments.base import Environments
-from tightrope.control.environments.faults import policy_of
+from tightrope.control.environments.faults import first_unusable, policy_of
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
@@ -408,9 +408,9 @@ def _normalisers(environments: Environments, settings: TrainSettings) -> Normali
 
 def require_finite(inputs: Inputs) -> Inputs:
     """The inputs as they are. ValueError for a NaN or an infinity, from which any action could follow."""
-    good = np.isfinite(inputs["flat"]) if "flat" in inputs else np.True_
-    if not good.all():
-        row, index = np.argwhere(~good)[0]
+    found = first_unusable(inputs["flat"]) if "flat" in inputs else None
+    if found is not None:
+        row, index = found
         raise ValueError(
             f"observation {row} holds {inputs['flat'][row, index]} at index {index}; expected finite numbers."
         )

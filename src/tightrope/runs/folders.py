@@ -19,9 +19,14 @@ USES = {
 }
 
 
+def command_of(settings: dict[str, Any]) -> str | None:
+    """The command whose settings these are; None when no field tells."""
+    return next((name for name, field in OWN_FIELDS.items() if field in settings), None)
+
+
 def require_kind(path: Path, settings: dict[str, Any], command: str) -> None:
     """ValueError when these settings are of a run of another command; it names what can read that run."""
-    found = next((name for name, field in OWN_FIELDS.items() if field in settings), command)
+    found = command_of(settings) or command
     if found != command:
         raise ValueError(
             f"{path} is a run of tightrope {found}, expected one of tightrope {command}. It is whole: use "

@@ -22,6 +22,7 @@ from tightrope.errors import TightropeError
 
 FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
 LONGEST_PAUSE = 2.0
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 _T = TypeVar("_T")
 
 
@@ -224,10 +225,17 @@ def kind_of(value: Any) -> str:
 # --------------------------------------------------------------------------------------------------- checks
 
 
+def first_unusable(numbers: Any) -> tuple[int, ...] | None:
+    """The index of the first number that is NaN, infinite or beyond float32, in which the networks learn;
+    None when every number can be used.
+    """
+    good = np.abs(numbers) <= FLOAT32_MAX  # False for NaN
+    return None if good.all() else tuple(int(i) for i in np.argwhere(~good)[0])
+
+
 def check_finite(what: str, numbers: Any) -> None:
-    """ApiBreak for the first NaN or infinity."""
-    good = np.isfinite(numbers)
-    if not good.all():
-        index = tuple(int(i) for i in np.argwhere(~good)[0])
+    """ApiBreak for the first number that cannot be used (see `first_unusable`)."""
+    index = first_unusable(numbers)
+    if index is not None:
         place = f" at index {', '.join(map(str, index))}" if index else ""
         raise ApiBreak(f"{what} = {np.asarray(numbers)[index]}{place}, expected finite numbers")

@@ -12,13 +12,16 @@ from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
 from tightrope.control.engine.base import Acted, Engine
 from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments
-from tightrope.control.environments.faults import action_text, circumstances
+from tightrope.control.environments.faults import (
+    FLOAT32_MAX,
+    action_text,
+    circumstances,
+    first_unusable,
+)
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.spaces import Array, Inputs
 from tightrope.errors import TightropeError
-
-FLOAT32_MAX = float(np.finfo(np.float32).max)  # rewards are learned from in float32
 
 
 class BadNumbers(TightropeError, ValueError):
@@ -186,10 +189,10 @@ class Collector:
             if "flat" in x:
                 checks.append(("final observation", x["flat"][:, None], final_rows, first_step + t + 1, t))
         for what, numbers, which, first, column in checks:
-            good = np.abs(numbers) <= FLOAT32_MAX  # False for NaN; beyond it the learning overflows
-            if good.all():
+            found = first_unusable(numbers)
+            if found is None:
                 continue
-            place, t, index = np.argwhere(~good)[0]
+            place, t, index = found
             row = int(which[place])
             where = f"step {first + t}" + ("" if what == "reward" else f", index {index}")
             action = None
