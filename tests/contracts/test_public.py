@@ -7,7 +7,7 @@ import importlib
 import tomllib
 
 import pytest
-from source_tree import ROOT, SRC, module_of, name_of, sources, tree
+from source_tree import ROOT, SRC, imports, module_of, name_of, sources, tree
 
 import tightrope
 
@@ -44,34 +44,33 @@ def test_names_are_sorted():
                 assert names == sorted(names), name_of(path)
 
 
-# packages that do not list their public names yet; take one out when it does, never add one
-WITHOUT_ALL = {
-    "tightrope.control.engine",
-    "tightrope.control.engine.compiled",
-    "tightrope.control.environments",
-    "tightrope.control.policy",
-    "tightrope.control.rollout",
-    "tightrope.language.alignment",
-    "tightrope.language.data",
-    "tightrope.language.generation",
-    "tightrope.language.model",
-    "tightrope.language.policy",
-    "tightrope.language.reward",
-    "tightrope.language.supervised",
-}
-
-
 def test_packages_list_their_public_names():
-    found = set()
     for path in sources():
         if path.name == "__init__.py":
             package = importlib.import_module(module_of(path))
-            if not hasattr(package, "__all__"):
-                found.add(module_of(path))
-            for name in getattr(package, "__all__", ()):
+            for name in package.__all__:
                 there = (path.parent / f"{name}.py").is_file() or getattr(package, name) is not None
                 assert there, f"{module_of(path)} has no {name}"
-    assert found == WITHOUT_ALL
+
+
+def test_the_rooms_of_a_story_are_entered_through_what_they_list():
+    """`tightrope.control.engine` lists `base` and `choose`: no file outside the folder imports another."""
+    rooms = {
+        module_of(p): importlib.import_module(module_of(p)).__all__
+        for p in sources()
+        if p.name == "__init__.py" and module_of(p).count(".") >= 2
+    }
+    assert len(rooms) >= 12
+    modules = {module_of(p) for p in sources()}
+    entered = {room: set() for room in rooms}
+    for path in sources():
+        for line, target in imports(tree(path), module_of(path), package=path.name == "__init__.py"):
+            module = target if target in modules else target.rpartition(".")[0]
+            room, _, name = module.rpartition(".")
+            if room in rooms and not (module_of(path) + ".").startswith(room + "."):
+                assert name in rooms[room], f"{name_of(path)}:{line}: {room} does not list {name}"
+                entered[room].add(name)
+    assert {room: sorted(names) for room, names in entered.items()} == rooms
 
 
 def test_every_public_name_is_there():

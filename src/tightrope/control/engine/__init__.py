@@ -1,1 +1,3 @@
 """Who computes: torch or the compiled CPU engine."""
+
+__all__ = ["base", "choose"]

@@ -1,1 +1,3 @@
 """Actors, critics and what they see."""
+
+__all__ = ["normalise", "policy"]

@@ -1,1 +1,3 @@
 """Collecting rollouts."""
+
+__all__ = ["collector", "rollout"]

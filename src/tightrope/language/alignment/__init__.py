@@ -1,1 +1,3 @@
 """The third stage: PPO."""
+
+__all__ = ["align", "experience", "samples"]

@@ -1,1 +1,3 @@
 """Rows to tokens."""
+
+__all__ = ["batching", "examples"]

@@ -1,1 +1,3 @@
 """Sampling and what a policy gives to tokens."""
+
+__all__ = ["distribution", "sample"]

@@ -5,3 +5,5 @@ cache. What it supports is decided in plan.py, which does not need numba.
 
     compiled_engine > update, infer > layers, distributions, threads > primitives
 """
+
+__all__ = ["cache", "infer", "plan", "threads", "update"]
