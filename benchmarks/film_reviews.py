@@ -164,9 +164,9 @@ def sentence(results: dict[str, Any]) -> str:
     before, after = (statistics.mean(found[f"gold_{when}"] for found in held) for when in ("before", "after"))
     slowest = max(found["ppo_seconds"] for found in held)
     lines = [
-        f"glassllm (0.85 M parameters), {len(held)} seeds: a gold judge that PPO never sees goes from "
-        f"{before:.2f} to **{after:.2f}** in P(positive), at {results['kl_mean']:.1f} nats a response; PPO "
-        f"takes {slowest:.0f} s on one core at most."
+        f"glassllm (0.85 M parameters), {len(held)} seeds: P(positive), by a judge that PPO never sees, "
+        f"rises from {before:.2f} to **{after:.2f}** at a KL of {results['kl_mean']:.1f} nats a response. "
+        f"PPO takes {slowest:.0f} s on one core for the slowest seed."
     ]
     real = results["runs"].get("smollm2")
     if real:

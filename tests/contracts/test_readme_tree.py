@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
 import pytest
-from source_tree import ROOT, blocks, files, name_of, pages, sources
+from source_tree import ROOT, blocks, files, name_of, pages, sources, tree
 
 
 def listed(text: str) -> dict[str, str]:
@@ -44,6 +45,26 @@ def test_the_map_fits_on_a_screen():
 
 def test_every_line_explains():
     assert not [path for path, words in MAP.items() if path != "src/tightrope" and len(words) < 8]
+
+
+def lines_to_read(text: str) -> int:
+    """Lines of the files that a reading order links to; only of the functions that it names in brackets."""
+    total = 0
+    for target, names in re.findall(r"\]\((src/[^)]+)\)(?: \(([^)]+)\))?", text):
+        wanted = re.findall(r"`(\w+)`", names)
+        found = {n.name: n for n in ast.walk(tree(ROOT / target)) if isinstance(n, ast.FunctionDef)}
+        parts = [found[name] for name in wanted]
+        whole = len((ROOT / target).read_text(encoding="utf-8").splitlines())
+        total += sum((n.end_lineno or 0) - n.lineno + 1 for n in parts) if parts else whole
+    return total
+
+
+def test_the_reading_order_of_a_story_is_about_1500_lines():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    control, _, language = text.split("**Reading order**")[1].split("The examples:")[0].partition("Language:")
+    control = control.split("The compiled engine")[0]
+    for story in (control, language):
+        assert 1_200 <= lines_to_read(story) <= 1_800
 
 
 @pytest.mark.parametrize("page", pages(), ids=name_of)

@@ -14,13 +14,12 @@ from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.language.alignment.kl import (
-    KL_FORMS,
     adapted,
     kl_loss,
     kl_rewards,
     shared_scale,
 )
-from tightrope.language.settings import AlignSettings
+from tightrope.language.settings import KL_FORMS, AlignSettings
 from tightrope.maths import returns, statistics, surrogate
 
 EXACT = dict(rtol=0, atol=1e-10)

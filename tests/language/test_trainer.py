@@ -13,13 +13,13 @@ from tightrope.algorithms.micro_batches import OutOfMemory
 from tightrope.language.alignment.align import align
 from tightrope.language.alignment.experience import gather
 from tightrope.language.alignment.iteration import Trainer, hold_out_prompts
-from tightrope.language.alignment.kl import KL_FORMS, adapted
+from tightrope.language.alignment.kl import adapted
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.data.examples import Prompt
 from tightrope.language.model import lora
 from tightrope.language.policy.policy_model import PolicyModel
 from tightrope.language.reward.call import RewardError
-from tightrope.language.settings import AlignSettings, RewardSettings
+from tightrope.language.settings import KL_FORMS, AlignSettings, RewardSettings
 from tightrope.language.supervised.preferences import train_reward
 from tightrope.training.events import Listeners
 

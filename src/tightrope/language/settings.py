@@ -10,6 +10,8 @@ from tightrope.algorithms.settings import PPOSettings
 from tightrope.settings.fields import SCHEDULES, Schedule, fixed, of_update_rule, setting
 from tightrope.settings.values import Settings
 
+KL_FORMS = ("k1-reward", "exact-split", "k2-loss", "exact-loss")  # their equations: alignment/kl.py
+
 Tune = Literal["lora", "full"]
 
 
@@ -131,7 +133,7 @@ class AlignSettings(ModelSettings):
     kl: str = setting(
         "k1-reward",
         "Where the KL acts: in the reward (k1), exact and split, or only in the loss.",
-        choices=("k1-reward", "exact-split", "k2-loss", "exact-loss"),
+        choices=KL_FORMS,
     )
     allow_biased_kl: bool = fixed(False)  # in settings.json of older runs
     kl_goal: float | None = setting(

@@ -54,10 +54,10 @@ import math
 import torch
 from torch import Tensor
 
+from tightrope.language.settings import KL_FORMS
 from tightrope.maths import divergence, statistics, surrogate
 from tightrope.maths.shapes import require_same_shape
 
-KL_FORMS = ("k1-reward", "exact-split", "k2-loss", "exact-loss")
 LARGEST_CHANGE = 0.2  # Ziegler 2019: the relative error of the KL is clipped to +- this
 
 
