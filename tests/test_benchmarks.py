@@ -97,7 +97,7 @@ def test_flags_are_those_of_the_command_line():
     from tightrope.cli.options import training_options
 
     wanted = report.tightrope_settings(SMALL) | {"total_steps": 2048}
-    _, values = training_options("train", ["CartPole-v1", *report.flags(wanted)])
+    _, values, _ = training_options("train", ["CartPole-v1", *report.flags(wanted)])
     assert values["env"] == "CartPole-v1"
     assert {name: values[name] for name in wanted} == wanted
 

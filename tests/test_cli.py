@@ -31,7 +31,7 @@ def run_main(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str,
 
 
 def resolved(*words: str) -> tuple[str, dict[str, Any]]:
-    _, values = options.training_options("train", list(words))
+    _, values, _ = options.training_options("train", list(words))
     return values.pop("env"), values
 
 

@@ -9,7 +9,7 @@
     ├── BadNumbers                      ValueError          a NaN or an infinity from an environment
     ├── SamplingMismatch                RuntimeError        sampling and training disagree on probabilities
     ├── OutOfMemory                     RuntimeError        memory ran out during an update
-    ├── DoesNotFit                      ValueError          a language job needs more memory than there is
+    ├── DoesNotFit                      ValueError          a job needs more memory than there is
     ├── EnvironmentFault                RuntimeError        an environment failed, hung or died
     ├── ApiBreak                                            internal: becomes an EnvironmentFault
     ├── RewardError                     ValueError          a reward function cannot be used

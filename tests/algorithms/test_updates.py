@@ -16,6 +16,7 @@ from tightrope.algorithms.descent import SamplingMismatch
 from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.algorithms.optimise import make_optimiser
 from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings
+from tightrope.maths.divergence import k3
 from tightrope.maths.statistics import masked_mean
 
 RULES = [
@@ -307,6 +308,28 @@ def test_the_kl_penalty_holds_the_policy_back():
     _, loose = run(ppo, settings)
     _, tight = run(ppo, dataclasses.replace(settings, kl_beta=30.0))
     assert tight["train/approx_kl"] < 0.3 * loose["train/approx_kl"]
+
+
+def test_approx_kl_is_of_the_last_epoch_and_kl_after_of_the_batch_behind_it():
+    """As the peers have it: a mean over all epochs is diluted by the first, in which the KL is near 0."""
+    settings = PPOSettings(num_epochs=1, minibatch_size=24, learning_rate=1e-2)
+    _, one = run(ppo, settings)
+    assert one["train/approx_kl"] == pytest.approx(0, abs=1e-6)
+    _, two = run(ppo, dataclasses.replace(settings, num_epochs=2))
+    batch = make_batch(TinyModel())
+    model, _ = run(ppo, settings, batch=batch)
+    with torch.no_grad():
+        wanted = k3(model(batch).logp - batch.old_logp)[batch.mask].mean()
+    assert two["train/approx_kl"] == pytest.approx(float(wanted), rel=1e-4)
+    assert "train/kl_after" not in two
+    adaptive = dataclasses.replace(settings, kl_beta=1e-12, kl_adapt=0.01, clip=1e6, num_epochs=3)
+    for size in (24, 5):
+        batch = make_batch(TinyModel())
+        model, found = run(ppo, dataclasses.replace(adaptive, minibatch_size=size), batch=batch)
+        with torch.no_grad():
+            wanted = k3(model(batch).logp - batch.old_logp)[batch.mask].mean()
+        assert found["train/kl_after"] == pytest.approx(float(wanted), rel=1e-4)
+        assert found["train/kl_after"] > found["train/approx_kl"]
 
 
 def test_adaptive_kl_beta_doubles_and_halves():

@@ -138,12 +138,27 @@ class Descent:
         self.meter.extreme("ratio_max", torch.where(mask, ratio, 0.0), largest=True)
         return sums["approx_kl"]
 
+    def begin_epoch(self) -> None:
+        """A new pass begins: `approx_kl` is a mean over the last one alone."""
+        self.meter.forget("approx_kl")
+
+    @torch.no_grad()
+    def kl_after(self, batch: Batch, size: int) -> float:
+        """k3 of the batch under the model as it is now, mean over counting steps; ``size`` rows a pass."""
+        sums = []
+        for part in batch.split(min(size, self.micro_batches.size or size)):
+            log_ratio = surrogate.log_ratio(self.model(part).logp, part.old_logp, part.mask)
+            sums.append(statistics.masked_sum(divergence.k3(log_ratio), part.mask))
+        return float(torch.stack(sums).sum() / batch.mask.sum())
+
     def halted(self) -> bool:
         """Whether to stop, waiting for an accelerator; NonFiniteError when the last gradient was bad."""
         return self.checked.halted(self._explain, poll=True)
 
     def metrics(self) -> dict[str, float]:
-        """Means over every minibatch. NonFiniteError when the last gradient was bad."""
+        """Means over every minibatch, of approx_kl over those of the last epoch. NonFiniteError when the last
+        gradient was bad.
+        """
         self.halted()
         return {
             **self.meter.means(),
@@ -153,7 +168,7 @@ class Descent:
 
 
 def check_first_ratios(log_ratio: Tensor, limit: float | None) -> None:
-    """Before the first step every ratio must be 1: what is sampled is what is trained.
+    """Before the first step of an update every ratio must be 1: what is sampled is what is trained.
 
     Raises SamplingMismatch when max |log_ratio| is above ``limit`` (None: not checked).
     """
@@ -162,10 +177,10 @@ def check_first_ratios(log_ratio: Tensor, limit: float | None) -> None:
     worst = float(log_ratio.abs().max())
     if math.isfinite(worst) and worst > limit:  # the check before the step names other numbers
         raise SamplingMismatch(
-            f"Before any update the log-probabilities differ by {worst:.3g} from those that sampled (limit "
-            f"{limit:g}). Sampling and training disagree. Likely causes: dropout or batch normalisation left "
-            "on in the policy, a normaliser that moved between rollout and update, another temperature or "
-            "action mask in training."
+            f"Before the first step of an update the log-probabilities differ by {worst:.3g} from those that "
+            f"sampled (limit {limit:g}). Sampling and training disagree. Likely causes: dropout or batch "
+            "normalisation left on in the policy, a normaliser that moved between rollout and update, "
+            "another temperature or action mask in training."
         )
 
 
@@ -182,6 +197,11 @@ class Meter:
     def copy(self) -> Meter:
         """Another meter with the same sums."""
         return Meter(dict(self.sums), dict(self.counts), dict(self.extremes))
+
+    def forget(self, name: str) -> None:
+        """Begin the sum of this name again."""
+        self.sums.pop(f"train/{name}", None)
+        self.counts.pop(f"train/{name}", None)
 
     def add(self, mask: Tensor, **per_step: Tensor | tuple[Tensor, float]) -> dict[str, Tensor]:
         """Add [B, T] quantities, and return their sums; steps outside the mask do not count. A pair is a sum

@@ -37,8 +37,8 @@ def value_loss(new: Tensor, part: Batch, settings: PPOSettings) -> Tensor:
 
 
 def next_kl_beta(kl_beta: float, kl: float, kl_adapt: float) -> float:
-    """The adaptive KL penalty of the PPO paper (eq. 8): halved below kl_adapt / 1.5, doubled above 1.5
-    kl_adapt.
+    """The adaptive KL penalty of the PPO paper (eq. 8): halved where ``kl``, after the update, is below
+    kl_adapt / 1.5, doubled above 1.5 kl_adapt.
     """
     if kl < kl_adapt / 1.5:
         return kl_beta / 2
@@ -57,7 +57,8 @@ def update(
     refresh: Callable[[Batch], Batch] | None = None,
     log_ratio_limit: float | None = None,
 ) -> dict[str, float]:
-    """Improve ``model`` on one rollout; returns the metrics, means over every minibatch.
+    """Improve ``model`` on one rollout; returns the metrics, means over every minibatch; approx_kl over those
+    of the last epoch, kl_after (with ``kl_adapt``) over the batch after the last step.
 
     ``model(batch) -> Evaluation``. ``extra_loss(model, part, evaluation, count) -> (loss, metrics)``:
     the loss is a sum over the part / ``count``, the counting steps of the whole minibatch, as the rest is;
@@ -81,6 +82,7 @@ def update(
         return Terms(policy, value, total)
 
     for epoch in range(settings.num_epochs):
+        descent.begin_epoch()
         if epoch and refresh is not None and settings.recompute_advantages:
             batch = refresh(batch).cleared()
         for number, minibatch in enumerate(batch.minibatches(settings.minibatch_size, rng), start=1):
@@ -89,4 +91,7 @@ def update(
                 break
         if descent.halted():
             break
-    return descent.metrics()
+    metrics = descent.metrics()
+    if settings.kl_beta is not None and settings.kl_adapt is not None:
+        metrics["train/kl_after"] = descent.kl_after(batch, settings.minibatch_size)
+    return metrics

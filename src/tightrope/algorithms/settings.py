@@ -26,7 +26,7 @@ class UpdateSettings(Settings):
         0.0, "Weight of the entropy bonus; more keeps the policy exploring for longer.", at_least=0
     )
     entropy_weight_schedule: Schedule = setting(
-        "constant", "How entropy_weight falls over the run.", choices=SCHEDULES
+        "constant", "How entropy_weight falls over the run.", choices=SCHEDULES, needs={"entropy_weight": ...}
     )
     learning_rate: float = setting(
         3e-4, "Adam's step size (actor, and critic unless it has its own).", above=0
@@ -75,12 +75,20 @@ class PPOSettings(UpdateSettings):
     clip: float = setting(
         0.2, "The ratio new/old probability may move this far from 1 before its gradient is cut.", above=0
     )
-    clip_schedule: Schedule = setting("constant", "How clip falls over the run.", choices=SCHEDULES)
+    clip_schedule: Schedule = setting(
+        "constant", "How clip falls over the run.", choices=SCHEDULES, needs={"kl_beta": (None,)}
+    )
     clip_high: float | None = setting(
-        None, "Another upper side for the clip (1 + clip_high); none: clip.", above=0
+        None,
+        "Another upper side for the clip (1 + clip_high); none: clip.",
+        above=0,
+        needs={"kl_beta": (None,)},
     )
     dual_clip: float | None = setting(
-        None, "Bound the loss of bad actions at dual_clip * |advantage|; none: off, 3 is usual.", above=1
+        None,
+        "Bound the loss of bad actions at dual_clip * |advantage|; none: off, 3 is usual.",
+        above=1,
+        needs={"kl_beta": (None,)},
     )
     value_clip: float | None = setting(
         None,
@@ -97,6 +105,7 @@ class PPOSettings(UpdateSettings):
         None,
         "With kl_beta: the KL per update aimed at, kl_beta doubles or halves to reach it; none: fixed.",
         above=0,
+        needs={"kl_beta": ...},
     )
     recompute_advantages: bool = setting(
         False, "Estimate values and advantages again before each later epoch."

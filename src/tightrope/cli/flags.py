@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import decimal
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
@@ -119,12 +120,17 @@ def settings_fields(kind: type) -> dict[str, dataclasses.Field[Any]]:
     return {f.name: f for f in dataclasses.fields(kind) if f.init and f.name not in ("env", "update")}
 
 
-def add_fields(group: argparse._ArgumentGroup, kind: type, names: Iterable[str]) -> None:
-    """One option a field: its help is made from doc, range and default."""
+def add_fields(
+    group: argparse._ArgumentGroup, kind: type, names: Iterable[str], presets: dict[str, str] | None = None
+) -> None:
+    """One option a field: its help is made from doc, range and default. ``presets``: how a default that
+    presets change is written, by name.
+    """
     fields = settings_fields(kind)
     for name in names:
         field, (plain, optional) = fields[name], kinds(kind)[name]
-        flag, text = "--" + name.replace("_", "-"), help_text(field, optional)
+        flag = "--" + name.replace("_", "-")
+        text = help_text(field, optional, (presets or {}).get(name, "{}"))
         if plain is bool:
             group.add_argument(
                 flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text
@@ -137,8 +143,8 @@ def add_fields(group: argparse._ArgumentGroup, kind: type, names: Iterable[str])
             group.add_argument(flag, type=reader(plain, optional, choices), metavar=metavar, help=text)
 
 
-def help_text(field: dataclasses.Field[Any], optional: bool) -> str:
-    """``Discount per step. (0 < x <= 1; default 0.99)``."""
+def help_text(field: dataclasses.Field[Any], optional: bool, written: str = "{}") -> str:
+    """``Discount per step. (0 < x <= 1; default 0.99)``; ``written``: how, with {} for the default."""
     default = field.default
     if default is None:
         shown = "none"
@@ -151,7 +157,7 @@ def help_text(field: dataclasses.Field[Any], optional: bool) -> str:
     limits = range_text(field.metadata)
     if optional:
         limits = f"{limits}, or none" if limits else "or none"
-    text = f"{field.metadata['doc']} ({limits + '; ' if limits else ''}default {shown})"
+    text = f"{field.metadata['doc']} ({limits + '; ' if limits else ''}default {written.format(shown)})"
     return text.replace("%", "%%")
 
 
@@ -191,7 +197,10 @@ def whole_number(word: str) -> int:
     try:
         return int(word)
     except ValueError:
-        number = float(word)
-        if not number.is_integer():
-            raise
+        try:
+            number = decimal.Decimal(word)  # exact, where a float makes 1e-400 a 0
+        except decimal.InvalidOperation:
+            raise ValueError(word) from None
+        if not number.is_finite() or number.adjusted() > 999 or number != number.to_integral_value():
+            raise ValueError(word) from None
         return int(number)

@@ -26,7 +26,10 @@ from tightrope.cli.options import (
 )
 from tightrope.cli.train_commands import require_transformers, resume, train
 from tightrope.errors import TightropeError
+from tightrope.runs.durable import CannotWrite
 from tightrope.runs.records import printable
+
+CANNOT_WRITE = 74  # EX_IOERR of sysexits.h
 
 
 def _evaluate(words: list[str]) -> int:
@@ -35,7 +38,7 @@ def _evaluate(words: list[str]) -> int:
     import_env_module(given)
     from tightrope.control.saving import evaluate_run
 
-    names = ("episodes", "stochastic", "best", "seed", "env", "device")
+    names = ("episodes", "stochastic", "best", "seed", "env", "device", "evaluation_max_steps")
     result = evaluate_run(given["run"], **{name: given[name] for name in names if name in given})
     if given.get("json"):
         print_json(result)
@@ -43,6 +46,8 @@ def _evaluate(words: list[str]) -> int:
         mean, half_width, count = (result[name] for name in ("mean_return", "ci95", "episodes"))
         print(f"mean return {mean:.2f}, deviation {result['std_return']:.2f}, {count} episodes")
         print(f"95 % interval of the mean: {mean - half_width:.2f} to {mean + half_width:.2f}")
+        if "success_rate" in result:
+            print(f"success rate {result['success_rate']:.2f}")
     return 0
 
 
@@ -184,8 +189,8 @@ def _show_warning(message: Warning | str, *_args: Any, **_kwargs: Any) -> None:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run a command line and return its exit code: 0, 2 for a user's mistake, 130 after Ctrl-C, 143 after
-    SIGTERM.
+    """Run a command line and return its exit code: 0, 2 for a user's mistake, CANNOT_WRITE where the disk
+    refuses, 130 after Ctrl-C, 143 after SIGTERM.
     """
     words = sys.argv[1:] if words is None else words
     for stream in (sys.stdout, sys.stderr):
@@ -204,6 +209,6 @@ def main(words: list[str] | None = None) -> int:
         if not _is_ours(error):
             raise
         print(f"{PROGRAM}: {printable(str(error))}", file=sys.stderr)
-        return 2
+        return CANNOT_WRITE if isinstance(error, CannotWrite) else 2
     except KeyboardInterrupt:
         return 130

@@ -24,6 +24,7 @@ from tightrope.cli.flags import (
     whole_number,
     with_dashes,
 )
+from tightrope.control.presets import decided
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 from tightrope.language.settings import RECIPES, AlignSettings, ModelSettings, RewardSettings, SFTSettings
 from tightrope.runs.folders import command_of
@@ -41,6 +42,7 @@ GROUPS = {
     "evaluation and saving": (
         "evaluate_every",
         "evaluation_episodes",
+        "evaluation_max_steps",
         "checkpoint_every",
         "keep_checkpoints",
         "tensorboard",
@@ -50,6 +52,7 @@ GROUPS = {
 }
 
 Options = dict[str, Any]
+ORIGINS = "origins"  # what --dry-run adds to the settings; a settings file may hold it
 SETTINGS_CLASSES: dict[str, type[Settings]] = {
     "train": TrainSettings,
     "sft": SFTSettings,
@@ -62,8 +65,9 @@ DESCRIPTIONS: dict[str, tuple[str, str, str | None]] = {
     "train": (
         "ENV",
         "Train a policy on a Gymnasium task, and leave a run folder with everything about it.",
-        "Defaults shown are those of an unknown task; presets change some of them for the tasks they know. "
-        "--dry-run prints what holds. Each setting may be given after a settings file, too: the flag wins.",
+        "Defaults that depend on the task say preset. --dry-run prints each value that holds, and its "
+        "origin: default, preset, settings file or flag. Each setting may be given after a settings file, "
+        "too: the flag wins.",
     ),
     "sft": (
         "--model M --data FILE",
@@ -137,13 +141,18 @@ def _output(parser: Parser) -> None:
     group.add_argument("--quiet", action="store_true", help="Print the end only.")
 
 
-def dry_run(settings: Settings, given: Options) -> bool:
-    """Whether --dry-run was given; then the settings are printed."""
+def dry_run(settings: Settings, given: Options, origins: Mapping[str, str]) -> bool:
+    """Whether --dry-run was given; then the settings are printed, and the origin of each: that in
+    ``origins``, else it is the default.
+    """
     if given.get("dry_run"):
+        shown = settings.to_json()
+        every = [*(name for name in shown if name != "update"), *shown.get("update", {})]
+        shown[ORIGINS] = {name: origins.get(name, "default") for name in every}
         if given.get("json"):
-            print_json(settings.to_json())
+            print_json(shown)
         else:
-            print(json.dumps(settings.to_json(), indent=2))
+            print(json.dumps(shown, indent=2))
     return bool(given.get("dry_run"))
 
 
@@ -171,22 +180,27 @@ def training_parser(command: str, algorithm: str = "ppo") -> Parser:
     parser = Parser(f"{PROGRAM} {command}", f"%(prog)s {usage} [options]", description, epilog)
     if command == "train":
         parser.add_argument("env", nargs="?", metavar="ENV", help="Gymnasium id, like CartPole-v1.")
+    presets = _presets(algorithm) if command == "train" else {}
     for title, names in _groups(command).items():
         rule = rule_of(kind, algorithm) if title == "update rule" else None
         if rule is None:
-            add_fields(parser.add_argument_group(title), kind, names)
+            add_fields(parser.add_argument_group(title), kind, names, presets)
         else:
             others = ", ".join(name for name in ALGORITHM_SETTINGS if name != algorithm)
             hint = f"For those of {others}: --algorithm NAME --help." if command == "train" else None
             group = parser.add_argument_group(f"update rule: {algorithm}", hint)
-            add_fields(group, rule, settings_fields(rule))
+            add_fields(group, rule, settings_fields(rule), presets)
     folder = "ENV-ALGORITHM-SEED-TIME" if command == "train" else "COMMAND-MODEL-TIME"
     group = parser.add_argument_group("run")
     group.add_argument("--run-dir", metavar="FOLDER", help=f"Where the run is saved (default runs/{folder}).")
     group.add_argument(
         "--settings", metavar="FILE", help="Run RUN/settings.json again; flags on top of it (default: none)."
     )
-    group.add_argument("--dry-run", action="store_true", help="Print the resolved settings as JSON and stop.")
+    group.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="Print the resolved settings and their origins as JSON and stop.",
+    )
     if command == "train":
         _common(parser, run=False)
     else:
@@ -196,6 +210,12 @@ def training_parser(command: str, algorithm: str = "ppo") -> Parser:
             "--recipe", choices=tuple(RECIPES), metavar="NAME", help=f"One of: {', '.join(RECIPES)}."
         )
     return parser
+
+
+def _presets(algorithm: str) -> dict[str, str]:
+    """How --help writes the defaults that presets change."""
+    listed, always = decided(algorithm)
+    return dict.fromkeys(listed, "{}, or preset") | dict.fromkeys(always, "preset")
 
 
 def _groups(command: str) -> Mapping[str, Iterable[str]]:
@@ -225,6 +245,12 @@ def evaluate_parser() -> Parser:
     )
     group = parser.add_argument_group("evaluation")
     group.add_argument("--episodes", type=_at_least_one, metavar="N", help="How many (default 100).")
+    group.add_argument(
+        "--evaluation-max-steps",
+        type=_at_least_one,
+        metavar="N",
+        help="Steps after which an episode is cut (default: as in the run).",
+    )
     group.add_argument(
         "--stochastic", action="store_true", help="Sample actions; default: the most likely one."
     )
@@ -338,9 +364,9 @@ def _bounded(word: str, low: int) -> int:
     return number
 
 
-def training_options(command: str, words: list[str]) -> tuple[Options, Options]:
-    """The options given, and the value of each setting that --settings, --recipe or a flag names. Flags win
-    over the recipe, the recipe over the file.
+def training_options(command: str, words: list[str]) -> tuple[Options, Options, dict[str, str]]:
+    """The options given, the value of each setting that --settings, --recipe or a flag names, and which of
+    the three it was. Flags win over the recipe, the recipe over the file.
     """
     words = [with_dashes(word) for word in words]
     path = _value_of("--settings", words)
@@ -367,7 +393,9 @@ def training_options(command: str, words: list[str]) -> tuple[Options, Options]:
     for name, value in of_file.items():
         if name not in flags:
             _refuse_code(command, str(path), name, value)
-    return given, {**of_file, **recipe, **flags}
+    origins = {"settings file": of_file, "recipe": recipe, "flag": flags}
+    origin_of = {name: origin for origin, values in origins.items() for name in values}
+    return given, {**of_file, **recipe, **flags}, origin_of
 
 
 def _value_of(flag: str, words: list[str]) -> str | None:
@@ -407,7 +435,9 @@ def _settings_in(path: str) -> Any:
     if not file.is_file():
         raise UsageError(f"--settings {path}: there is no such file. Give RUN/settings.json.")
     found = read_json(file)
-    return unsigned(found) if isinstance(found, dict) else found
+    if not isinstance(found, dict):
+        return found
+    return {name: value for name, value in unsigned(found).items() if name != ORIGINS}
 
 
 def _values_of_file(command: str, path: str) -> Options:

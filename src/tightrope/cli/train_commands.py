@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import shlex
@@ -25,6 +26,7 @@ from tightrope.cli.options import (
     training_options,
 )
 from tightrope.runs import checkpoint, signals
+from tightrope.runs.durable import CannotWrite
 from tightrope.runs.folders import command_of
 from tightrope.runs.run import Run
 from tightrope.settings.values import Settings
@@ -42,18 +44,20 @@ Training = Callable[..., Any]
 
 def train(command: str, words: list[str]) -> int:
     """``tightrope train ENV``, ``sft``, ``reward``, ``align``: resolve the settings, train, print the end."""
-    given, values = training_options(command, words)
+    given, values, origins = training_options(command, words)
     if command == "train":
         env = values.pop("env", None)
         if env is None:
             raise UsageError("Which task? Give a Gymnasium id: tightrope train CartPole-v1")
         import_env_module(given)
-        from tightrope.control.resolve import resolve
+        from tightrope.control.resolve import resolve_with_preset
 
-        settings: Settings = resolve(env, values.pop("algorithm", "ppo"), values)
+        settings: Settings
+        settings, preset = resolve_with_preset(env, values.pop("algorithm", "ppo"), values)
+        origins = dict.fromkeys(preset, "preset") | origins
     else:
         settings = SETTINGS_CLASSES[command]().with_values(**values)
-    if dry_run(settings, given):
+    if dry_run(settings, given, origins):
         return 0
     for name, example in REQUIRED.get(command, {}).items():
         if not getattr(settings, name):
@@ -131,6 +135,11 @@ def _watched(command: str, given: Options, which: int, *args: Any, **values: Any
         again = _command("resume", shown.run, given) if shown.run else ""
         print(farewell(error, shown.run, shown.step, view.counted, again), file=sys.stderr)
         return error.code if isinstance(error, signals.Stopped) else 130
+    except CannotWrite as error:
+        if shown.run and error.command:
+            with contextlib.suppress(ValueError, OSError):  # the folder may be gone
+                error.command = _command("resume", shown.run, given)  # with the user's own code that it needs
+        raise
     summary = ended if isinstance(ended, dict) else ended.summary
     if as_json:
         print_json({**summary, "run_dir": shown.run})

@@ -28,17 +28,20 @@ from tightrope.control.environments.faults import first_unusable, policy_of
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
+from tightrope.control.memory import require_fit
 from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import Collector
-from tightrope.control.rollout.rollout import Rollout, to_batch
+from tightrope.control.rollout.episodes import FinishedEpisodes
+from tightrope.control.rollout.rollout import to_batch
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import Array, Inputs, ObservationLayout, structure
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint
 from tightrope.training.events import Message
 from tightrope.training.learner import Update, crosses
+from tightrope.training.memory import DoesNotFit
 from tightrope.training.parameters import Tensors
 
 MIN_COLUMNS = 16  # ten epochs on fewer steps than this would only add noise to a finished policy
@@ -65,10 +68,12 @@ class Agent:
     ) -> None:
         self.settings = settings or resolve(env, self.algorithm, values)
         self.env = env
+        require_fit(self.settings)
         self.environments = _environments(env, self.settings)
         present = self.settings
         torch_device = usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
+        self._require_fit(present, policy)
         threads = present.threads or (available_cores() if layouts[0].image_shapes else 1)
         with limited_threads(threads):  # the QR of the first weights rounds differently with more threads
             self.policy = Policy(*layouts, present, policy).to(torch_device)
@@ -86,8 +91,31 @@ class Agent:
         self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
         self.steps, self.rollbacks, self.kl_beta = 0, 0, getattr(present.update, "kl_beta", None)
         self.changes: dict[str, Any] = {}  # of the update rule's settings, made by a listener
+        self.episodes = FinishedEpisodes()
         self.fresh, self.notify = True, notify  # fresh: new episodes begin with the next rollout
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
+        if settings is None:
+            for text in self.without_effect(present):
+                notify(text)
+
+    def without_effect(self, settings: TrainSettings) -> list[str]:
+        """Which settings were changed and do nothing here."""
+        found, box = settings.without_effect(), bool(self.environments.action_layout.gaussian.any())
+        usual = {"std": "independent", "squash": False}
+        return found + [
+            f"{name} has no effect: the task has no Box action."
+            for name, value in usual.items()
+            if not box and getattr(settings, name) != value
+        ]
+
+    def _require_fit(self, settings: TrainSettings, policy: Any) -> None:
+        environments = self.environments
+        layouts = (environments.observation_layout, environments.action_layout)
+        try:
+            require_fit(settings, *layouts, own_policy=policy is not None)
+        except DoesNotFit:
+            environments.close()
+            raise
 
     # ---------------------------------------------------------------------------------------------- learning
 
@@ -111,15 +139,15 @@ class Agent:
                 "expected at least that many. Give more steps, or fewer num_envs."
             )
         start = self.steps if start is None else start
-        first, every = True, self.settings.checkpoint_every
+        every = self.settings.checkpoint_every
         while (columns := self._next_columns(budget, start)) > 0:
             if self.fresh:
                 self.collector.reset(self.settings.seed, self.steps)
             before = self.steps - start
             # BLAS threads beside the engine's two only spin: its products are too small to share
             with limited_threads(1 if self.engine.name == "fused" else self.settings.threads or 1):
-                metrics, episodes = self._one_update(columns, (self.steps - start) / budget, check=first)
-            first, after = False, self.steps - start
+                metrics, episodes = self._one_update(columns, (self.steps - start) / budget)
+            after = self.steps - start
             on_grid = crosses(before, after, budget, every)
             self.fresh = on_grid and not self.environments.gives_state
             yield Update(after, budget, metrics, before, on_grid, episodes)
@@ -131,7 +159,7 @@ class Agent:
         return columns if enough else 0
 
     def _one_update(
-        self, columns: int, progress: float, *, check: bool
+        self, columns: int, progress: float
     ) -> tuple[dict[str, float], list[tuple[float, int, bool]]]:
         """collect -> advantages -> update -> statistics."""
         present = self.settings.update.unchecked(**self.changes).at(progress)
@@ -149,18 +177,20 @@ class Agent:
                 present,
                 self.update_rng,
                 refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
-                log_ratio_limit=self._log_ratio_limit(batch) if check else None,
+                log_ratio_limit=self._log_ratio_limit(batch),
             )
             metrics["train/explained_variance"] = float(
                 explained_variance(batch.old_values, batch.returns, batch.mask)
             )
-        kl = metrics.get("train/approx_kl")
+        kl = metrics.get("train/kl_after")
         if isinstance(present, PPOSettings) and present.kl_beta and present.kl_adapt and kl is not None:
             self.kl_beta = ppo.next_kl_beta(present.kl_beta, kl, present.kl_adapt)
         self.normalisers.update(rollout)
         self.steps += rollout.steps
         finish = time.perf_counter()
-        metrics |= _settings_metrics(present) | _episode_metrics(rollout)
+        metrics |= _settings_metrics(present) | self.episodes.add(rollout)
+        if rollout.restarts is not None:
+            metrics["rollout/environment_restarts"] = float(rollout.restarts)
         metrics["time/env_seconds"] = rollout.env_seconds
         metrics["time/act_seconds"] = collected - begin - rollout.env_seconds
         metrics["time/update_seconds"] = finish - collected
@@ -168,8 +198,10 @@ class Agent:
         return metrics, rollout.episodes
 
     def _log_ratio_limit(self, batch: Batch) -> float:
-        """1e-5, times what rounding in float32 grows with: columns, the size of inputs, a small deviation."""
-        scale = float(max(1, self.environments.action_layout.num_columns))
+        """1e-5, times what rounding in float32 grows with: columns, the size of inputs, a small deviation;
+        and a hundred after the first update, when the weights may have grown.
+        """
+        scale = float(max(1, self.environments.action_layout.num_columns)) * (100.0 if self.steps else 1.0)
         if "flat" in batch.inputs:
             scale *= max(1.0, float(batch.inputs["flat"].abs().max()))
         if self.policy.log_std is not None:
@@ -237,6 +269,7 @@ class Agent:
                 )
         old.close()
         self.env, self.environments, self.fresh = env, fresh, True
+        self.episodes = FinishedEpisodes()
         self.collector = Collector(fresh, self.normalisers, self.sampling_rng)
         named = dataclasses.replace(free, env=fresh.spec_id)
         self.settings = _resolved(named, fresh, self.engine.name, free.threads)
@@ -260,6 +293,7 @@ class Agent:
             "kl_beta": self.kl_beta,
             "rollbacks": self.rollbacks,
             "environment_restarts": self.environments.restarts,
+            "finished_episodes": self.episodes.state(),
             "spaces": self._spaces(),
             "own_policy": self.policy.own is not None,
             "own_environment": self.env is not None and not isinstance(self.env, str),
@@ -301,6 +335,7 @@ class Agent:
         self.kl_beta = None if beta is None else float(beta)
         self.rollbacks = int(state.get("rollbacks", 0))  # missing in old runs
         self.collector.count_from(max(0, int(state.get("environment_restarts", 0))))
+        self.episodes.restore(state.get("finished_episodes", {}))  # missing in old runs
         self.sampling_rng.bit_generator.state = state["rng"]["sampling"]
         self.update_rng.bit_generator.state = state["rng"]["update"]
 
@@ -429,13 +464,3 @@ def _settings_metrics(present: UpdateSettings) -> dict[str, float]:
     names = ("learning_rate", "critic_learning_rate", "clip", "entropy_weight", "kl_beta")
     found = {f"train/{name}": getattr(present, name, None) for name in names}
     return {name: value for name, value in found.items() if value is not None}
-
-
-def _episode_metrics(rollout: Rollout) -> dict[str, float]:
-    found = {"rollout/episodes": float(len(rollout.episodes))}
-    if rollout.restarts is not None:
-        found["rollout/environment_restarts"] = float(rollout.restarts)
-    if rollout.episodes:
-        found["rollout/ep_rew_mean"] = float(np.mean([e[0] for e in rollout.episodes]))
-        found["rollout/ep_len_mean"] = float(np.mean([e[1] for e in rollout.episodes]))
-    return found

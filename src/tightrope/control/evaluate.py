@@ -14,6 +14,7 @@ from tightrope.control.environments.make import make_environments
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 
 MAX_COPIES = 10
+SHORTEST_LIMIT = 1_000  # steps that an episode may always have
 
 
 def evaluate_agent(
@@ -23,19 +24,23 @@ def evaluate_agent(
     *,
     seed: int = EVALUATION_SEED,
     deterministic: bool = True,
+    max_steps: float = math.inf,
 ) -> dict[str, Any]:
     """Returns and lengths of ``episodes`` episodes; normalisers and weights are not touched.
 
     Every copy plays its own fixed share of the episodes, so that short episodes are not counted more often
-    than long ones. Gives ``mean_return``, ``std_return``, ``ci95`` (half width), ``mean_length``,
-    ``episodes``, ``returns``.
+    than long ones. One that has not ended after ``max_steps`` counts as it stands, and its copy waits for the
+    others: then all are reset. Gives ``mean_return``, ``std_return``, ``ci95`` (half width), ``mean_length``,
+    ``episodes``, ``returns``, ``cut_episodes``, and where episodes tell (success.py), ``success_rate``.
     """
     rows = environments.num_envs
     share = np.array([episodes // rows + (i < episodes % rows) for i in range(rows)])
     rng = None if deterministic else np.random.default_rng([seed, 3])
     inputs, action_mask = environments.reset(seed)
-    totals, lengths = np.zeros(rows), np.zeros(rows, np.int64)
+    totals, lengths, waits = np.zeros(rows), np.zeros(rows, np.int64), np.zeros(rows, bool)
     found: list[tuple[float, int]] = []
+    successes: list[float] = []
+    cut = 0
     while share.any():
         step = environments.step(agent.choose(inputs, action_mask, rng))
         real = np.ones(rows, bool) if step.phantom is None else ~step.phantom
@@ -44,13 +49,26 @@ def evaluate_agent(
             totals[step.cut], lengths[step.cut] = 0.0, 0
         totals += np.where(real, step.rewards, 0.0)
         lengths += real
-        for row in np.flatnonzero((step.terminated | step.truncated) & real):
-            if share[row]:
+        ends, counts = (step.terminated | step.truncated) & real, (share > 0) & ~waits
+        late = (lengths >= max_steps) & counts & ~ends
+        for row in np.flatnonzero(ends | late):
+            if counts[row]:
                 found.append((float(totals[row]), int(lengths[row])))
                 share[row] -= 1
+                if step.success is not None and ends[row] and not math.isnan(step.success[row]):
+                    successes.append(float(step.success[row]))
             totals[row], lengths[row] = 0.0, 0
+        cut, waits = cut + int(late.sum()), waits | late
         inputs, action_mask = step.inputs, step.action_mask
-    return _summary(found)
+        if waits.any() and share.any() and not share[~waits].any():
+            again = np.random.SeedSequence([seed, int(share.sum())]).generate_state(1)[0] >> 2
+            inputs, action_mask = environments.reset(int(again))
+            totals[:], lengths[:], waits[:] = 0.0, 0, False
+    return _summary(found) | {"cut_episodes": cut} | _rate(successes)
+
+
+def _rate(successes: list[float]) -> dict[str, float]:
+    return {"success_rate": float(np.mean(successes))} if successes else {}
 
 
 def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:
@@ -64,6 +82,28 @@ def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:
         "episodes": len(found),
         "returns": [float(x) for x in returns],
     }
+
+
+def step_limit(settings: TrainSettings, environments: Environments, longest: float) -> float:
+    """Steps after which an evaluation episode is cut: ``evaluation_max_steps`` where it is given, else the
+    time limit of the task, at least SHORTEST_LIMIT and twice the ``longest`` training episode that ended.
+
+    Training ends the episodes that a deterministic policy might never end, by the noise of its actions.
+    Infinite where the longest is unknown: a run of an older version, which had no limit.
+    """
+    if settings.evaluation_max_steps is not None:
+        return settings.evaluation_max_steps
+    return max(SHORTEST_LIMIT, 2 * longest, environments.max_episode_steps or 0)
+
+
+def cut_text(result: dict[str, Any], limit: float) -> str | None:
+    """The line that tells how many episodes of an evaluation were cut; None: none was."""
+    if not (cut := result["cut_episodes"]):
+        return None
+    return (
+        f"{cut} of {result['episodes']} evaluation episodes had not ended after {limit:,.0f} steps and were "
+        "cut: they count with their return so far. --evaluation-max-steps N moves the limit."
+    )
 
 
 def evaluation_environments(env: Any, settings: TrainSettings, episodes: int) -> Environments:

@@ -94,6 +94,18 @@ BY_TASK = {"ppo": PPO_PRESETS, "a2c": A2C_PRESETS, "reinforce": REINFORCE_PRESET
 A2C_DEFAULT = {"num_steps": 16, "learning_rate": 7e-4, "normalise_rewards": True}
 
 
+KINDS = ("discrete", "continuous", "images")
+
+
+def decided(algorithm: str) -> tuple[set[str], set[str]]:
+    """The settings that presets decide for some tasks, and those that are decided for every task that is
+    not listed.
+    """
+    kinds = [set(preset("", algorithm, kind)) for kind in KINDS]
+    listed = {name for values in BY_TASK[algorithm].values() for name in values}
+    return listed.union(*kinds), set.intersection(*kinds)
+
+
 def preset(
     env_id: str, algorithm: str, kind: str | None = None, max_episode_steps: int | None = None
 ) -> dict[str, Any]:

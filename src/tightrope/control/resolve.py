@@ -15,6 +15,13 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
 
     Raises ValueError for values out of range and for names that the algorithm does not know.
     """
+    return resolve_with_preset(env, algorithm, overrides)[0]
+
+
+def resolve_with_preset(
+    env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None = None
+) -> tuple[TrainSettings, dict[str, Any]]:
+    """The settings as `resolve` gives them, and what the task's preset would set where nothing is given."""
     from tightrope.control.environments.tasks import name_of, time_limit
 
     values = dict(overrides or {})
@@ -38,7 +45,8 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
         total = {"total_steps": TrainSettings.total_steps, **merged}["total_steps"]
         if type(total) is int and total > 0 and type(sizes[0]) is int:
             chosen["checkpoint_every"] = _checkpoint_interval(limit * min(sizes[0], total) / total)
-    return TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
+    settings = TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
+    return settings, chosen
 
 
 def _checkpoint_interval(episode: float) -> float:

@@ -44,7 +44,9 @@ class TrainSettings(Settings):
         choices=("independent", "state", "gsde"),
     )
     log_std_init: float = setting(0.0, "Log of the first deviation of Box actions.", at_least=-10, at_most=3)
-    gsde_steps: int = setting(8, "With gSDE: steps for which one exploration matrix is held.", at_least=1)
+    gsde_steps: int = setting(
+        8, "With gSDE: steps for which one exploration matrix is held.", at_least=1, needs={"std": ("gsde",)}
+    )
     squash: bool = setting(
         False, "Box actions pass through tanh onto the bounds; off: clipped to the bounds."
     )
@@ -66,6 +68,7 @@ class TrainSettings(Settings):
         "With workers: processes to spread the copies over; none: one a core, this process included.",
         at_least=1,
         at_most=1024,
+        needs={"vector_backend": ("auto", "workers")},
     )
     engine: str = setting(
         "auto",
@@ -90,6 +93,7 @@ class TrainSettings(Settings):
         10,
         "With on_env_fault restart: new environments at most, in all; then the run ends.",
         at_least=1,
+        needs={"on_env_fault": ("restart",)},
     )
     env_timeout: float | None = setting(
         60.0,
@@ -105,7 +109,16 @@ class TrainSettings(Settings):
         at_most=1,
     )
     evaluation_episodes: int = setting(
-        10, "Episodes per evaluation, deterministic, on seeds of their own.", at_least=1
+        10,
+        "Episodes per evaluation, deterministic, on seeds of their own.",
+        at_least=1,
+        needs={"evaluate_every": ...},
+    )
+    evaluation_max_steps: int | None = setting(
+        None,
+        "Steps after which an evaluation episode is cut; none: the time limit, at least 1,000 and twice the "
+        "longest episode that ended in training.",
+        at_least=1,
     )
     checkpoint_every: float | None = setting(
         0.05,

@@ -10,7 +10,7 @@ from typing import Any
 
 from tightrope.control.agent import AGENTS, Agent
 from tightrope.control.environments.make import Environments
-from tightrope.control.evaluate import evaluate_agent, evaluation_environments
+from tightrope.control.evaluate import cut_text, evaluate_agent, evaluation_environments, step_limit
 from tightrope.control.resolve import resolve
 from tightrope.control.saving import name_again, rebuild
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
@@ -45,6 +45,8 @@ def train(
     require_tensorboard(settings.tensorboard)
     source = settings.env if env is None else env
     agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=report.info)
+    for text in agent.without_effect(settings):
+        report.warn(text)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
     with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name) as run:
@@ -132,6 +134,7 @@ class AgentLearner:
         self.merit = None  # the newest checkpoints are kept; the best policy has its own folder
         self._environments: Environments | None = None
         self._first_state: Any = None
+        self._told_of_cuts = False
         self._begin = (0, 0.0)
 
     @property
@@ -201,15 +204,25 @@ class AgentLearner:
         self._environments.count_from(0)
         if self._first_state is not None:
             self._environments.set_state(self._first_state)
-        result = evaluate_agent(self.agent, self._environments, self.settings.evaluation_episodes)
+        limit = step_limit(self.settings, self._environments, self.agent.episodes.longest)
+        count = self.settings.evaluation_episodes
+        result = evaluate_agent(self.agent, self._environments, count, max_steps=limit)
+        if (text := cut_text(result, limit)) and not self._told_of_cuts:
+            self._told_of_cuts = True
+            self.listeners.warn(f"{text} Later evaluations tell it as eval/cut_episodes.")
         if result["mean_return"] > self.best:
             self._keep(result["mean_return"])
-        return {
+        found = {
             "eval/mean_reward": result["mean_return"],
             "eval/std_reward": result["std_return"],
             "eval/mean_length": result["mean_length"],
             "eval/episodes": float(result["episodes"]),
         }
+        if result["cut_episodes"]:
+            found["eval/cut_episodes"] = float(result["cut_episodes"])
+        if "success_rate" in result:
+            found["eval/success_rate"] = result["success_rate"]
+        return found
 
     def _keep(self, mean: float) -> None:
         """Save the policy as the best. If it cannot be written, the one before stays the best."""

@@ -23,12 +23,15 @@ class ModelSettings(Settings):
     tune: Tune = setting(
         "lora", "Train low-rank adapters on a frozen trunk, or every weight.", choices=("lora", "full")
     )
-    lora_rank: int = setting(16, "Rank of the adapters.", at_least=1)
-    lora_alpha: float = setting(32.0, "Adapters are scaled by lora_alpha / lora_rank.", above=0)
+    lora_rank: int = setting(16, "Rank of the adapters.", at_least=1, needs={"tune": ("lora",)})
+    lora_alpha: float = setting(
+        32.0, "Adapters are scaled by lora_alpha / lora_rank.", above=0, needs={"tune": ("lora",)}
+    )
     lora_layers: int | None = setting(
         None,
         "Adapt this many of the top layers; the layers below are computed once. none: every layer.",
         at_least=1,
+        needs={"tune": ("lora",)},
     )
     seed: int = setting(0, "Seed of everything random.", at_least=0)
     device: str = setting("cpu", "Torch device: cpu, cuda, cuda:1, mps.")
@@ -139,7 +142,9 @@ class AlignSettings(ModelSettings):
     kl_goal: float | None = setting(
         None, "Adapt kl_beta towards this KL per response, in nats (Ziegler: 6); none: fixed.", above=0
     )
-    kl_horizon: float = setting(10_000.0, "Responses over which kl_beta adapts.", above=0)
+    kl_horizon: float = setting(
+        10_000.0, "Responses over which kl_beta adapts.", above=0, needs={"kl_goal": ...}
+    )
     kl_budget: float | None = setting(None, "Stop at this KL per response, in nats; none: continue.", above=0)
 
     critic: str = setting(
@@ -169,16 +174,25 @@ class AlignSettings(ModelSettings):
         choices=("terminal", "bootstrap"),
     )
     ptx_weight: float = setting(0.0, "Weight of the pretraining loss (InstructGPT: 27.8).", at_least=0)
-    ptx_data: str | None = setting(None, "Texts of the pretraining loss.")
-    ptx_per_response: int = setting(1, "Pretraining texts per response (InstructGPT: 8).", at_least=1)
+    ptx_data: str | None = setting(None, "Texts of the pretraining loss.", needs={"ptx_weight": ...})
+    ptx_per_response: int = setting(
+        1, "Pretraining texts per response (InstructGPT: 8).", at_least=1, needs={"ptx_weight": ...}
+    )
     reward_timeout: float | None = setting(
         60.0, "Seconds a reward function may take; its samples are left out then. none: no limit.", above=0
     )
     evaluate_every: float | None = setting(
-        0.05, "Fraction of the run between gold scores on held-out prompts.", above=0, at_most=1
+        0.05,
+        "Fraction of the run between gold scores on held-out prompts.",
+        above=0,
+        at_most=1,
+        needs={"gold": ...},
     )
     held_out_prompts: int = setting(
-        64, "Prompts kept for the gold score, a quarter of all at most; more of them, less noise.", at_least=1
+        64,
+        "Prompts kept for the gold score, a quarter of all at most; more of them, less noise.",
+        at_least=1,
+        needs={"gold": ...},
     )
 
     def __post_init__(self) -> None:

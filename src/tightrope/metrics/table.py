@@ -14,14 +14,36 @@ _TABLE = (
         "rollout/ep_rew_mean",
         "reward",
         "up",
-        "Mean return of the training episodes that ended in this rollout.",
+        "Mean return of the last 100 training episodes.",
         negative=True,
     ),
     metric(
         "rollout/ep_len_mean",
         "steps",
         "any",
-        "Mean length of the training episodes that ended in this rollout.",
+        "Mean length of the last 100 training episodes.",
+    ),
+    metric(
+        "rollout/new_ep_rew_mean",
+        "reward",
+        "up",
+        "Mean return of the training episodes that ended in this rollout; absent: none did.",
+        negative=True,
+    ),
+    metric(
+        "rollout/new_ep_len_mean",
+        "steps",
+        "any",
+        "Mean length of the training episodes that ended in this rollout; absent: none did.",
+    ),
+    metric(
+        "rollout/success_rate",
+        "fraction",
+        "up",
+        'Share of successes among the last 100 training episodes with info["is_success"] in their last step; '
+        "absent: no episode had it.",
+        low=0.0,
+        high=1.0,
     ),
     metric("rollout/episodes", "episodes", "any", "Episodes that ended in this rollout."),
     metric(
@@ -50,8 +72,17 @@ _TABLE = (
         "train/approx_kl",
         "nats",
         "inside",
-        "k3 estimate of KL(old || new): mean of ratio - 1 - log ratio, never negative; above 0.05 for "
-        "several updates the policy moves too far on old data.",
+        "k3 estimate of KL(old || new) in the last epoch: mean of ratio - 1 - log ratio before each of its "
+        "steps, never negative; above 0.05 for several updates the policy moves too far on old data.",
+        low=0.0,
+        high=0.05,
+    ),
+    metric(
+        "train/kl_after",
+        "nats",
+        "inside",
+        "The same on the whole rollout after the last step of the update, which kl_beta is adapted to; with "
+        "kl_adapt alone.",
         low=0.0,
         high=0.05,
     ),
@@ -135,8 +166,8 @@ _TABLE = (
         "train/log_ratio_first",
         "nats",
         "down",
-        "Largest |log ratio| before the first gradient step: 0 up to rounding: what is sampled is trained. "
-        "Range of the control story; language: up to 0.0001 in float32, 1 in bfloat16.",
+        "Largest |log ratio| before the first gradient step of the update: 0 up to rounding: what is sampled "
+        "is trained. Range of the control story; language: up to 0.0001 in float32, 1 in bfloat16.",
         low=0.0,
         high=1e-5,
     ),
@@ -165,6 +196,23 @@ _TABLE = (
     metric("eval/std_reward", "reward", "any", "Standard deviation of the evaluation episodes' returns."),
     metric("eval/mean_length", "steps", "any", "Mean length of the evaluation episodes."),
     metric("eval/episodes", "episodes", "any", "Number of evaluation episodes."),
+    metric(
+        "eval/cut_episodes",
+        "episodes",
+        "down",
+        "Evaluation episodes that had not ended after evaluation_max_steps; they count with their return and "
+        "length so far. Absent: none.",
+        high=0.0,
+    ),
+    metric(
+        "eval/success_rate",
+        "fraction",
+        "up",
+        'Share of successes among the evaluation episodes with info["is_success"] in their last step; '
+        "absent: none had it.",
+        low=0.0,
+        high=1.0,
+    ),
 )
 
 METRICS: dict[str, Metric] = {m.name: m for m in (*_TABLE, *LANGUAGE_TABLE)}

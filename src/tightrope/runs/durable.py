@@ -36,7 +36,12 @@ _ADVICE = {
 
 
 class CannotWrite(TightropeError, OSError):
-    """A path that could not be written, why, and what to do. What was saved before is intact."""
+    """A path that could not be written, why, and what to do. What was saved before is intact.
+
+    ``command``: what continues the run, where there is one.
+    """
+
+    command: str | None = None
 
     def __init__(self, path: Path, cause: BaseException) -> None:
         number, reason = getattr(cause, "errno", None), getattr(cause, "strerror", None) or str(cause)
@@ -47,10 +52,8 @@ class CannotWrite(TightropeError, OSError):
         self.advice = _ADVICE.get(number or 0, "Check the disk")
 
     def __str__(self) -> str:
-        return (
-            f"{self.what} {self.advice} and try again; a run that has a checkpoint continues with: "
-            "tightrope resume RUN"
-        )
+        again = f"; the run continues with: {self.command}" if self.command else "."
+        return f"{self.what} {self.advice} and try again{again}"
 
 
 @contextlib.contextmanager

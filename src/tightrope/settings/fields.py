@@ -9,12 +9,13 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping
-from types import NoneType, UnionType
+from types import EllipsisType, NoneType, UnionType
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 Schedule = Literal["constant", "linear", "cosine"]
 SCHEDULES = get_args(Schedule)
 LARGEST_INTEGER = 2**63 - 1  # whole numbers beyond it fit neither torch nor numpy
+LARGEST_FLOAT, SMALLEST_FLOAT = 3.4e38, 1.2e-38  # of float32; a positive number below becomes 0
 
 
 def setting(
@@ -25,13 +26,17 @@ def setting(
     at_most: float = math.inf,
     above: float = -math.inf,
     choices: tuple[str, ...] = (),
+    needs: Mapping[str, tuple[Any, ...] | EllipsisType] | None = None,
 ) -> Any:
     """A dataclass field with its help text and its range.
 
     ``at_least`` and ``at_most`` are inclusive, ``above`` is exclusive, ``choices`` lists the words allowed.
     A default of None means the setting is optional and ``none`` on the command line switches it off.
+    ``needs``: the values that other settings must have for this one to have an effect; ``...``: any that is
+    not none, off or 0.
     """
     metadata = {"doc": doc, "at_least": at_least, "at_most": at_most, "above": above, "choices": choices}
+    metadata["needs"] = needs or {}
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -119,8 +124,11 @@ def _check_range(field: dataclasses.Field[Any], value: Any) -> None:
         if type(number) not in (int, float):
             continue
         inside = limits["at_least"] <= number <= limits["at_most"] and number > limits["above"]
-        if not inside or not math.isfinite(number):
+        held = type(number) is int or number == 0 or SMALLEST_FLOAT <= abs(number) <= LARGEST_FLOAT
+        if not inside or not held:
             expected = range_text(limits) or "a finite number"
+            if inside and math.isfinite(number):
+                expected = f"0, or a size between {SMALLEST_FLOAT:g} and {LARGEST_FLOAT:g} (float32)"
             raise ValueError(f"{field.name} is {value!r}; expected {expected}. Choose a value in that range.")
 
 

@@ -39,6 +39,29 @@ class Settings:
             changed["update"] = dataclasses.replace(update, **inner) if isinstance(update, rule) else update
         return dataclasses.replace(self, **changed)
 
+    def without_effect(self) -> list[str]:
+        """Which settings were changed and do nothing, for lack of the values of others that they need."""
+        update = getattr(self, "update", None)
+        owners = [self, update] if isinstance(update, Settings) else [self]
+        flat = {
+            field.name: getattr(owner, field.name) for owner in owners for field in dataclasses.fields(owner)
+        }
+        found = []
+        for field in (field for owner in owners for field in dataclasses.fields(owner)):
+            value = flat[field.name]
+            if not field.init or value == field.default:
+                continue
+            for other, useful in field.metadata.get("needs", {}).items():
+                present = flat.get(other)
+                if bool(present) if useful is ... else present in useful:
+                    continue
+                wanted = "a value" if useful is ... else " or ".join(map(_shown, useful))
+                found.append(
+                    f"{field.name} {_shown(value)} has no effect: {other} is {_shown(present)}, and it needs "
+                    f"{wanted}."
+                )
+        return found
+
     def to_json(self) -> dict[str, Any]:
         """The settings as settings.json holds them: plain JSON types, the update rule's under ``update``."""
 
@@ -62,6 +85,13 @@ class Settings:
             return _flat(cls, data)
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from None
+
+
+def _shown(value: Any) -> str:
+    """As a flag takes it."""
+    if value is None:
+        return "none"
+    return ("on" if value else "off") if isinstance(value, bool) else str(value)
 
 
 def names(kind: type | None) -> set[str]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import shlex
 import time
 from collections.abc import Iterator
 from typing import Any
 
 from tightrope.runs import signals
+from tightrope.runs.durable import CannotWrite
 from tightrope.runs.run import Run
 from tightrope.training.events import Change, Evaluated, Finished, Listeners, Samples, Started, Updated
 from tightrope.training.learner import Learner, Update, change
@@ -17,6 +20,16 @@ from tightrope.training.tensorboard import TensorBoard
 def train(learner: Learner, run: Run, listeners: Listeners) -> dict[str, Any]:
     """Train from the present position to the end; returns the summary that is also in summary.json."""
     return _Loop(learner, run, listeners).train()
+
+
+@contextlib.contextmanager
+def _naming_the_command(run: Run) -> Iterator[None]:
+    """An error of the disk names the command that continues this run."""
+    try:
+        yield
+    except CannotWrite as error:
+        error.command = shlex.join(["tightrope", "resume", str(run.path)])
+        raise
 
 
 class _Loop:
@@ -31,10 +44,11 @@ class _Loop:
         learner, run = self.learner, self.run
         if learner.settings.tensorboard:
             self.listeners.add(TensorBoard())
-        with signals.stoppable():
+        with signals.stoppable(), _naming_the_command(run):
             self._start()
-            stop = self._requests()
+            stop, updated = self._requests(), False
             for update in () if stop else self._updates():
+                updated = True
                 signals.raise_if_stopped()
                 self._record(update)
                 # before the save, so that a resumed run knows the changes made before its checkpoint
@@ -42,7 +56,7 @@ class _Loop:
                     break
                 if update.on_grid and not learner.complete:  # the end has its own save
                     self._save()
-            self._evaluated(learner.position, learner.conclude())
+            self._conclude(row=updated)
             self._save(final=True)
             summary = learner.finish(run)
             run.finish(summary)
@@ -110,6 +124,15 @@ class _Loop:
         self.listeners(Updated(step, learner.total, learner.seconds, recorded))
         if update.on_grid and update.samples:
             self.listeners(Samples(step, update.samples))
+
+    def _conclude(self, *, row: bool) -> None:
+        """The final figures; ``row``: they are also a row of the metrics, which a run that was complete when
+        it was resumed has already.
+        """
+        learner, found = self.learner, self.learner.conclude()
+        if found and row:
+            self.run.record(learner.position, learner.seconds, found)
+        self._evaluated(learner.position, found)
 
     def _evaluated(self, step: int, found: dict[str, float]) -> None:
         if found:

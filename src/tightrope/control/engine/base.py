@@ -87,8 +87,8 @@ class Engine(Protocol):
         refresh: Callable[[Batch], Batch] | None = None,
         log_ratio_limit: float | None = None,
     ) -> dict[str, float]:
-        """The algorithm's update. ``log_ratio_limit`` is given for the first one of a run, in which the
-        compiled engine is compared with the reference; RuntimeError when they differ.
+        """The algorithm's update. In the first one with a ``log_ratio_limit`` the compiled engine is compared
+        with the reference; RuntimeError when they differ.
         """
 
     def close(self) -> None:

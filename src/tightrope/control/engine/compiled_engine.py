@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import time
 from collections.abc import Callable
 
@@ -25,6 +24,7 @@ from tightrope.control.spaces import Array, Inputs
 cache.mark_complete()  # importing infer and update has compiled or loaded every entry
 
 CHECK_LIMIT = 1e-4  # largest difference of a parameter after one minibatch
+CHECK_CLIP = 1e-3  # smallest clip in that comparison: within rounding, either side of a clip is right
 _NOTHING = np.zeros(0, np.float32)
 _NO_MASK = np.zeros((0, 1), bool)
 
@@ -60,6 +60,7 @@ class CompiledEngine:
         self._work = [plan.aligned_zeros(self._plan.work_size)]
         self._helper = threads.Helper()
         self._choice = threads.ThreadChoice(both=num_threads > 1 and policy.trunk is None)
+        self._compared = False  # with ppo.py, on the first minibatch of the first update
         self.attach()
 
     def attach(self) -> None:
@@ -165,8 +166,9 @@ class CompiledEngine:
         assert isinstance(settings, PPOSettings)
         batch.require_steps()
         self.attach()
-        if log_ratio_limit is not None:
+        if log_ratio_limit is not None and not self._compared:
             self._check(batch, settings)
+            self._compared = True
         rows, columns = _rows(batch), _columns(batch)
         run = _Run(self, columns, self._options(settings, log_ratio_limit))
         began, together = time.perf_counter(), self._choice.choose()
@@ -239,7 +241,9 @@ class CompiledEngine:
         changes.
         """
         steps = batch.as_steps().select(slice(0, settings.minibatch_size))
-        once = dataclasses.replace(settings, num_epochs=1)
+        clips = {name: getattr(settings, name) for name in ("clip", "clip_high", "value_clip")}
+        clips = {name: max(clip, CHECK_CLIP) for name, clip in clips.items() if clip is not None}
+        once = settings.unchecked(num_epochs=1, target_kl=None, **clips)
         pairs = [copy.deepcopy((self.policy, self.optimiser)) for _ in range(2)]
         for _, optimiser in pairs:
             for group in optimiser.param_groups:
@@ -260,6 +264,7 @@ class _Run:
         self.exchange, self.ledgers = np.zeros(4 * kernels.LEDGER), np.zeros((4, kernels.LEDGER))
         self.ledgers[0, [kernels.RATIO_MIN, kernels.RATIO_MAX]] = np.inf, -np.inf
         self.epoch, self.order = 0, np.zeros(0, np.int64)
+        self.rows_before = 0.0  # that the epochs before the present one have seen
 
     def _call(self, role: int, begin: int, epoch: int, epochs: int) -> int:
         e, p = self.engine, self.engine._plan
@@ -282,6 +287,8 @@ class _Run:
         status = kernels.RUNNING
         try:
             for self.epoch in range(num_epochs):
+                self.ledgers[0, kernels.KL] = 0.0
+                self.rows_before = float(self.ledgers[0, kernels.ROWS_SEEN])
                 permutation = rng.permutation(count)
                 self.order[:] = permutation if isinstance(rows, int) else rows[permutation]
                 status = self._call(role, 0, self.epoch, self.epoch + 1)
@@ -302,14 +309,14 @@ class _Run:
         return engine._helper.start(job, self.control)
 
     def metrics(self) -> dict[str, float]:
-        """Means over all rows of all minibatches, as ppo.update's."""
+        """Means over all rows of all minibatches, of approx_kl over those of the last epoch."""
         k, (actor, critic) = kernels, self.ledgers[:2]
         rows = actor[k.ROWS_SEEN]
         means = {
             "policy_gradient_loss": actor[k.POLICY] / rows,
             "value_loss": critic[k.VALUES] / critic[k.ROWS_SEEN],
             "entropy": actor[k.ENTROPY_SUM] / rows,
-            "approx_kl": actor[k.KL] / rows,
+            "approx_kl": actor[k.KL] / (rows - self.rows_before),
             "clip_fraction": (actor[k.HIGH] + actor[k.LOW]) / rows,
             "clip_fraction_high": actor[k.HIGH] / rows,
             "clip_fraction_low": actor[k.LOW] / rows,

@@ -23,6 +23,7 @@ class Step(NamedTuple):
     final_rows: np.ndarray | None = None  # int [F]: truncated rows whose ``inputs`` are the next episode's
     final_inputs: Inputs | None = None  # [F, ...]: the true last observations of these rows
     cut: np.ndarray | None = None  # bool [B]: restarted after a fault; this step did not take place there
+    success: np.ndarray | None = None  # float64 [B]: of episodes that ended here; NaN: not said (success.py)
 
 
 class Environments(ABC):

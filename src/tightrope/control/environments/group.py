@@ -30,6 +30,7 @@ from tightrope.control.environments.faults import (
     wait_before_restart,
 )
 from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, find_source
+from tightrope.control.environments.success import success_of
 from tightrope.control.environments.tasks import check_alike, make_all
 from tightrope.control.spaces import (
     MASK_KEY,
@@ -54,6 +55,7 @@ class StepBuffers:
     rewards: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
+    success: np.ndarray  # float64 [N]: of the episode that ended, NaN: not said
     masks: np.ndarray  # bool [N, L]
     cut: np.ndarray  # bool [N]: restarted in this step
     restarts: np.ndarray  # int64 [N]: since all were reset
@@ -75,6 +77,7 @@ class StepBuffers:
             rewards=zeros((num,), np.float64),
             terminated=zeros((num,), np.bool_),
             truncated=zeros((num,), np.bool_),
+            success=zeros((num,), np.float64),
             masks=zeros((num, actions.num_logits), np.bool_),
             cut=zeros((num,), np.bool_),
             restarts=zeros((num,), np.int64),
@@ -94,6 +97,9 @@ class StepBuffers:
     def step(self, has_masks: bool) -> Step:
         """The last step, copied."""
         rows = np.flatnonzero(self.truncated) if self.truncated.any() else None
+        success = None
+        if rows is not None or self.terminated.any():
+            success = np.where(self.terminated | self.truncated, self.success, np.nan)
         return Step(
             inputs={name: array.copy() for name, array in self.inputs.items()},
             action_mask=self.masks.copy() if has_masks else None,
@@ -103,6 +109,7 @@ class StepBuffers:
             final_rows=rows,
             final_inputs=None if rows is None else {k: array[rows] for k, array in self.final_inputs.items()},
             cut=self.cut.copy() if self.cut.any() else None,
+            success=success,
         )
 
 
@@ -221,7 +228,7 @@ class EnvGroup:
                 if strict:
                     check_finite("reward", rewards[row])
                 if terminated or truncated:
-                    observation, info = self._end(row, observation, terminated)
+                    observation, info = self._end(row, observation, terminated, info)
                 if plain:
                     if observation.shape != shape or observation.dtype is not dtype:
                         dtype = self._checked_dtype(observation)
@@ -248,9 +255,12 @@ class EnvGroup:
         self._dtype = observation.dtype
         return self._dtype
 
-    def _end(self, row: int, observation: Any, terminated: bool) -> tuple[Any, dict[str, Any]]:
+    def _end(
+        self, row: int, observation: Any, terminated: bool, info: dict[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
         """Record how the episode ended, keep a truncation's last observation, and reset."""
         self._dirty = True
+        self.buffers.success[row] = success_of(info)
         if terminated:
             self.buffers.terminated[row] = True
         else:

@@ -34,6 +34,8 @@ from tightrope.control.environments.faults import (
     wait_before_restart,
 )
 from tightrope.control.environments.masks import find_source, vector_masks
+from tightrope.control.environments.success import KEY as SUCCESS
+from tightrope.control.environments.success import vector_success
 from tightrope.control.environments.watchdog import Watchdog
 from tightrope.control.spaces import Inputs, action_layout, observation_layout
 
@@ -196,6 +198,9 @@ class VectorEnvironments(Environments):
         observations, rewards, terminated, truncated, infos = result
         rewards, terminated, truncated = self._check(rewards, terminated, truncated)
         inputs = self._encode(observations)
+        success = None
+        if "final_info" in infos or SUCCESS in infos:
+            success = vector_success(infos, (terminated | truncated) & ~self._ended)
         if self.mode == AutoresetMode.NEXT_STEP:
             phantom = self._ended if self._any_ended else None
             if phantom is not None:
@@ -205,14 +210,14 @@ class VectorEnvironments(Environments):
             self._ended = terminated | truncated
             self._any_ended = _any(self._ended)
             masks = self._masks(observations, infos, self._ended)
-            return Step(inputs, masks, rewards, terminated, truncated, phantom=phantom)
+            return Step(inputs, masks, rewards, terminated, truncated, phantom=phantom, success=success)
         if self.mode == AutoresetMode.SAME_STEP:
             rows = np.flatnonzero(truncated) if _any(truncated) else None
             finals = None if rows is None else self._final_inputs(infos, rows)
             masks = self._masks(observations, infos, None)
-            return Step(inputs, masks, rewards, terminated, truncated, final_rows=rows, final_inputs=finals)
+            return Step(inputs, masks, rewards, terminated, truncated, None, rows, finals, success=success)
         masks = self._masks(observations, infos, terminated | truncated)
-        return self._reset_ended(Step(inputs, masks, rewards, terminated, truncated))
+        return self._reset_ended(Step(inputs, masks, rewards, terminated, truncated, success=success))
 
     def _check(
         self, rewards: Any, terminated: Any, truncated: Any

@@ -160,6 +160,8 @@ class Collector:
             rollout.truncated[:, t] = step.truncated
             if step.phantom is not None:
                 np.logical_not(step.phantom, out=rollout.mask[:, t])
+            if step.success is not None:
+                rollout.successes += step.success[~np.isnan(step.success)].tolist()
             if step.cut is not None:
                 rollout.mask[step.cut, t] = False
                 rollout.ended[step.cut, t] = True

@@ -51,6 +51,7 @@ class Rollout:
         self.last: Inputs = {}
         self.finals: list[tuple[int, Array, Inputs]] = []
         self.episodes: list[tuple[float, int, bool]] = []
+        self.successes: list[float] = []  # of the episodes that said whether they reached their goal
         self.reward_statistics_taken = False
         self.env_seconds = 0.0
         self.restarts: int | None = None  # of environments; None: the settings do not allow it
@@ -65,6 +66,7 @@ class Rollout:
         self.mask.fill(True)
         self.ended.fill(False)
         self.finals = []
+        self.successes = []
         self.reward_statistics_taken = False
 
 

@@ -63,7 +63,7 @@ def align(
     settings = (settings or AlignSettings()).with_values(**values)
     settings = recorded(settings, data=prompts, reward=reward, gold=gold)
     events = Listeners(listeners)
-    for risk in settings.risks():
+    for risk in (*settings.risks(), *settings.without_effect()):
         events.warn(risk)
     require_tensorboard(settings.tensorboard)
     with threads(settings.threads):

@@ -1,8 +1,9 @@
 """Loading models, tokenizers and the files of model folders. Nothing in a folder is run.
 
 transformers would run code that a configuration names (``auto_map``) when allowed to, unpickle
-``pytorch_model.bin`` when there is no safetensors file, and hand an ``adapter_config.json`` to PEFT, which
-imports modules by the names it finds there. Here all three are refused.
+``pytorch_model.bin`` when there is no safetensors file, hand an ``adapter_config.json`` to PEFT, which
+imports modules by the names it finds there, fetch kernels that a configuration asks for, and read any file
+that an index, a configuration or a link names. Here all of these are refused.
 """
 
 from __future__ import annotations
@@ -23,6 +24,11 @@ from tightrope.runs.records import each_key_once
 # every file of a model folder in which transformers looks for the names of code
 CONFIGS = ("config.json", "generation_config.json", "tokenizer_config.json", "processor_config.json")
 UNPICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
+INDEX = "model.safetensors.index.json"
+# keys of config.json whose text may look like a path: transformers stores it and opens nothing
+TEXTS = ("_name_or_path", "name_or_path", "id2label", "label2id", "task_specific_params", "chat_template")
+# how experts are computed: other words have transformers fetch a kernel. Attention is chosen by `fused`.
+EXPERTS = (None, "eager", "batched_mm", "grouped_mm")
 
 
 def require_device(device: str) -> None:
@@ -119,6 +125,7 @@ def pretrained(kind: Any, folder: str | Path, **options: Any) -> Any:
     import torch
 
     refuse_code(folder)
+    refuse_places(folder)
     if kind.__name__.startswith("AutoModel") and "gguf_file" not in options:
         options["use_safetensors"] = True  # the other format is pickle
     try:
@@ -182,6 +189,97 @@ def _names_code(value: Any) -> bool:
     if isinstance(value, dict):
         return "auto_map" in value or any(map(_names_code, value.values()))
     return isinstance(value, list) and any(map(_names_code, value))
+
+
+def refuse_places(folder: str | Path) -> None:
+    """ValueError for a model whose files name a place outside of it, another kind of weights, or a kernel.
+
+    Looked at are links, the indices of weights, config.json (key by key: what may look like a path is in
+    TEXTS) and the file names in tokenizer_config.json.
+    """
+    path = Path(folder)
+    if path.is_dir():
+        _refuse_links(path)
+        indices = sorted(path.glob("*.index.json"))
+        config, tokenizer = path / "config.json", path / "tokenizer_config.json"
+    else:
+        found = [_of_hub(str(folder), name) for name in ("config.json", "tokenizer_config.json", INDEX)]
+        config, tokenizer = (Path(name) if name else path / "none" for name in found[:2])
+        indices = [Path(found[2])] if found[2] else []
+    for index in indices:
+        weights = read_object(index).get("weight_map")
+        for name in weights.values() if isinstance(weights, dict) else ():
+            if not _plain(name) or not name.endswith(".safetensors"):
+                raise ValueError(
+                    f"{index} names the weights {name!r}; expected safetensors files in the same folder, "
+                    "which alone are read. Save the model again with a recent transformers."
+                )
+    if config.exists():
+        _refuse_in_config(config, read_object(config))
+    if tokenizer.exists():
+        _refuse_file_names(tokenizer, read_object(tokenizer))
+
+
+def _of_hub(name: str, file: str) -> str | None:
+    """A file of a hub id, downloaded as loading would; None where it is missing or cannot be reached."""
+    from transformers.utils import cached_file
+
+    try:
+        return cached_file(name, file, _raise_exceptions_for_missing_entries=False)
+    except (OSError, ValueError):  # loading reports it
+        return None
+
+
+def _refuse_links(path: Path) -> None:
+    """ValueError for a link out of the folder. Those of a hub snapshot lead to blobs of the same model."""
+    root = path.resolve()
+    inside = [root, *([root.parent.parent / "blobs"] if root.parent.name == "snapshots" else [])]
+    for entry in sorted(path.iterdir()):
+        if entry.is_symlink() and not any(entry.resolve().is_relative_to(place) for place in inside):
+            raise ValueError(
+                f"{entry} is a link to {entry.resolve()}, outside the model's folder, where nothing is read. "
+                "Put the file itself there."
+            )
+
+
+def _plain(name: Any) -> bool:
+    """Whether this is the name of a file in the same folder."""
+    return isinstance(name, str) and not set("/\\:") & set(name) and name not in ("", ".", "..")
+
+
+def _refuse_in_config(path: Path, value: Any, key: str = "") -> None:
+    """ValueError for what in a configuration could make transformers fetch code or open a file."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            if name in ("quantization_config", "transformers_weights") and part is not None:
+                raise ValueError(
+                    f"{path} has {name}, which chooses code or files to load with. Only plain weights are "
+                    "read and trained: save the model without it (model.dequantize() where it is quantised)."
+                )
+            if name not in TEXTS:
+                _refuse_in_config(path, part, name)
+    elif isinstance(value, list):
+        for part in value:
+            _refuse_in_config(path, part, key)
+    elif "experts_implementation" in key and value not in EXPERTS:
+        raise ValueError(f"{path} has {key} {value!r}; expected one of {EXPERTS}. Take it out of the file.")
+    elif isinstance(value, str) and value and not _plain(value):
+        raise ValueError(
+            f"{path} has {key} {value!r}, which may name a place or code elsewhere. Nothing of the kind is "
+            "followed: take it out of the file where you trust the model."
+        )
+
+
+def _refuse_file_names(path: Path, value: Any) -> None:
+    """ValueError for a file elsewhere in a tokenizer's configuration."""
+    for key, part in value.items() if isinstance(value, dict) else ():
+        names = part if isinstance(part, list) else [part]
+        if key.endswith(("_file", "_files", "_path", "_dir")) and key not in TEXTS:
+            for name in names:
+                if isinstance(name, str) and not _plain(name):
+                    raise ValueError(f"{path} has {key} {name!r}; expected a file in the same folder.")
+        for part in names:
+            _refuse_file_names(path, part)
 
 
 def read_object(path: Path) -> dict[str, Any]:

@@ -45,6 +45,8 @@ def train_stage(
     """Train in a new folder ``run_dir`` (None: named after stage, model and seed); returns the summary."""
     settings = recorded(settings, **given, model=model and model[0])
     events = Listeners(listeners)
+    for text in settings.without_effect():
+        events.warn(text)
     with prepared(settings, stage.name, model, events) as loaded:
         learner = _learner(settings, loaded, stage.objective(settings, loaded, given, events))
         require_tensorboard(settings.tensorboard)

@@ -1,0 +1,55 @@
+"""The training episodes that ended last: what their means are taken over, and what bounds an evaluation."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from tightrope.control.rollout.rollout import Rollout
+
+RECENT = 100  # episodes that rollout/ep_rew_mean and its like are means of, as in stable-baselines3
+
+
+class FinishedEpisodes:
+    """Returns, lengths and successes of the last RECENT episodes, and the longest of all.
+
+    ``longest``: steps; infinity where it is not known, after a checkpoint of an older version.
+    """
+
+    def __init__(self) -> None:
+        self._newest: deque[tuple[float, int]] = deque(maxlen=RECENT)  # return, length
+        self._successes: deque[float] = deque(maxlen=RECENT)
+        self.longest: float = 0
+
+    def add(self, rollout: Rollout) -> dict[str, float]:
+        """Count the episodes of a rollout; the metrics of these and of the last RECENT ones."""
+        here = [(episode[0], episode[1]) for episode in rollout.episodes]
+        self._newest.extend(here)
+        self._successes.extend(rollout.successes)
+        self.longest = max([self.longest, *(length for _, length in here)])
+        found = {"rollout/episodes": float(len(here))}
+        for name, episodes in (("ep", self._newest), ("new_ep", here)):
+            if episodes:
+                found[f"rollout/{name}_rew_mean"], found[f"rollout/{name}_len_mean"] = np.mean(
+                    episodes, axis=0
+                ).tolist()
+        if self._successes:
+            found["rollout/success_rate"] = float(np.mean(self._successes))
+        return found
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs, as JSON."""
+        longest = self.longest if math.isfinite(self.longest) else None
+        return {"newest": list(self._newest), "successes": list(self._successes), "longest": longest}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Put back a `state`; an empty one is that of an older version."""
+        longest = state.get("longest")
+        self.longest = math.inf if longest is None else int(longest)
+        self._newest.clear()
+        self._newest.extend((float(total), int(length)) for total, length in state.get("newest", []))
+        self._successes.clear()
+        self._successes.extend(map(float, state.get("successes", [])))
