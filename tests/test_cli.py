@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -157,7 +158,46 @@ def shown(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
     """The settings that a command resolves."""
     code, out, err = run_main(capsys, *words, "--dry-run")
     assert code == 0, err
-    return json.loads(out)
+    found = json.loads(out)
+    found.pop("origins")
+    return found
+
+
+def origins(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, str]:
+    """Where the value of each setting comes from."""
+    code, out, err = run_main(capsys, *words, "--dry-run", "--json")
+    assert code == 0, err
+    return json.loads(out)["origins"]
+
+
+def test_a_dry_run_tells_where_each_value_comes_from(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    found = origins(capsys, "train", "LunarLander-v3", "--num-envs", "4", "--clip", "0.1")
+    names = {*TrainSettings().to_json(), *TrainSettings().to_json()["update"]} - {"update"}
+    assert set(found) == names
+    told = {
+        "num_envs": "flag", "clip": "flag", "env": "flag", "gamma": "preset", "num_steps": "preset",
+        "total_steps": "preset", "normalise_rewards": "preset", "clip_high": "default", "hidden": "default",
+    }  # fmt: skip
+    assert {name: found[name] for name in told} == told
+    code, out, _ = run_main(capsys, "train", "LunarLander-v3", "--num-envs", "4", "--dry-run")
+    (tmp_path / "settings.json").write_text(out)  # what was printed can be run
+    again = origins(capsys, "train", "--settings", str(tmp_path), "--gamma", "0.9")
+    assert (again["num_envs"], again["hidden"], again["gamma"]) == ("settings file", "settings file", "flag")
+    found = origins(capsys, "align", "--recipe", "ziegler2019", "--seed", "3")
+    assert (found["kl_goal"], found["seed"], found["top_k"]) == ("recipe", "flag", "default")
+
+
+def test_help_says_where_a_preset_decides() -> None:
+    """The default shown of such a setting would hold for no task, or only for tasks without a preset."""
+    shown = {action.dest: action.help or "" for action in options.training_parser("train")._actions}
+    for name, default in (
+        ("normalise_rewards", "preset"), ("entropy_weight", "preset"), ("gamma", "0.99, or preset"),
+        ("learning_rate", "0.0003, or preset"), ("total_steps", "100000, or preset"),
+        ("clip_schedule", "constant"), ("evaluate_every", "0.05"),
+    ):  # fmt: skip
+        assert shown[name].endswith(f"default {default})"), shown[name]
 
 
 @pytest.mark.parametrize("command", ["sft", "reward", "align"])

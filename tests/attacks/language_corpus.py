@@ -21,6 +21,7 @@ from attacks.corpus import (
     forge_file,
     link,
     pickled,
+    pipe,
     put,
     staged,
     torch_zip,
@@ -62,6 +63,20 @@ FAST = [
 ]
 
 
+PLACE = "may name a place or code elsewhere"
+
+
+def index(name: str) -> Callable[[Path], None]:
+    """Weights by an index, all in the file of this name."""
+
+    def plant(folder: Path) -> None:
+        weights = dict.fromkeys(tiny_llama().state_dict(), name)
+        (folder / "model.safetensors").unlink()
+        put("model.safetensors.index.json", json.dumps({"metadata": {}, "weight_map": weights}))(folder)
+
+    return plant
+
+
 def of_models() -> list[Attack]:
     """On a folder that is read as a model, as a reward model or as a judge."""
     code = both(put(f"{MARK}.py", corpus.MODULE), edit("config.json", auto_map=MAPPED))
@@ -83,13 +98,33 @@ def of_models() -> list[Attack]:
         Attack("unknown kind", edit("config.json", model_type=MARK), "cannot be loaded"),
         Attack("tokenizer of a module", edit("tokenizer_config.json", tokenizer_class=NAMED), None),
         Attack("_target_", edit("config.json", _target_=f"{MARK}.function"), None),
+        *(
+            Attack(f"attention by {key}", edit("config.json", **{key: f"{MARK}/kernel:function"}), PLACE)
+            for key in ("_attn_implementation", "_attn_implementation_internal", "attn_implementation")
+        ),
+        Attack("a place inside", edit("config.json", text_config={"backbone": f"../{MARK}"}), PLACE),
         Attack(
-            "internal attention", edit("config.json", _attn_implementation_internal=f"{MARK}/kernel"), None
+            "experts of a kernel", edit("config.json", _experts_implementation="sonicmoe"), "expected one of"
         ),
         Attack(
-            "attention of a kernel", edit("config.json", attn_implementation=f"{MARK}/kernel:function"), None
+            "quantised by", edit("config.json", quantization_config={"quant_method": MARK}), "chooses code"
         ),
-        Attack("quantised by", edit("config.json", quantization_config={"quant_method": MARK}), None),
+        Attack("weights by name", edit("config.json", transformers_weights="x.safetensors"), "chooses code"),
+        Attack(
+            "an index of pickles",
+            both(put("x.bin", torch_zip()), index("x.bin")),
+            "names the weights 'x.bin'",
+        ),
+        Attack("an index of what lies outside", index("../outside.safetensors"), "names the weights"),
+        Attack("weights that lie outside", link("model.safetensors", "elsewhere"), "is a link to"),
+        Attack("a tokenizer that lies outside", link("tokenizer.json", "elsewhere"), "is a link to"),
+        Attack("weights that are a pipe", pipe("model.safetensors"), "not a regular file"),
+        Attack("a tokenizer that is a pipe", pipe("tokenizer.json"), "not a regular file"),
+        Attack(
+            "words that lie outside",
+            edit("tokenizer_config.json", vocab_file="../outside.txt"),
+            "expected a file in the same folder",
+        ),
         Attack("adapter inside", put("adapter_config.json", json.dumps(ADAPTER)), "PEFT adapter"),
         Attack("only pickled weights", only_pickle, "a pickle, which is never read"),
         Attack("weights of 10 GB", put("model.safetensors", HUGE), "cannot be loaded"),

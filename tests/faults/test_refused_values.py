@@ -16,6 +16,7 @@ from gymnasium import spaces
 import tightrope
 from tightrope.cli.main import main
 from tightrope.control.environments.faults import EnvironmentFault
+from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import BadNumbers
 from tightrope.control.saving import evaluate_run
 from tightrope.control.train import resume, train
@@ -55,11 +56,68 @@ def agent() -> tightrope.PPO:
         ({"num_envs": 10**18}, r"num_envs is 1000000000000000000; expected 1 <= x <= 1e\+06"),
         ({"threads": 1_000_000}, "threads is 1000000; expected 1 <= x <= 1024"),
         ({"device": "meta"}, "device is 'meta', which holds no numbers. Choose cpu"),
+        ({"clip": 1e308}, r"clip is 1e\+308; expected 0, or a size between 1.2e-38 and 3.4e\+38 .float32"),
+        ({"max_grad_norm": 5e-324}, r"max_grad_norm is 5e-324; expected 0, or a size between"),
+        ({"evaluate_every": 5e-324}, r"evaluate_every is 5e-324; expected 0, or a size between"),
+        (
+            {"num_steps": 10**9},
+            r"num_envs 8 \* num_steps 1,000,000,000 steps takes .* GB.* Choose a smaller num_envs or num_steps",
+        ),
+        ({"num_envs": 10**6, "num_steps": 10**6}, "Choose a smaller num_envs or num_steps"),
+        ({"hidden": (10**6, 10**6)}, "the networks of hidden 1000000 1000000 .* Choose a smaller hidden"),
     ],
 )
 def test_settings_beyond_what_can_be_are_named(values: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         tightrope.PPO("CartPole-v1", **values)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"kl_adapt": 0.01}, "kl_adapt 0.01 has no effect: kl_beta is none, and it needs a value"),
+        ({"squash": True}, "squash has no effect: the task has no Box action"),
+        ({"std": "gsde"}, "std has no effect: the task has no Box action"),
+        ({"gsde_steps": 4}, "gsde_steps 4 has no effect: std is independent, and it needs gsde"),
+        (
+            {"num_workers": 2, "vector_backend": "serial"},
+            "num_workers 2 has no effect: vector_backend is serial, and it needs auto or workers",
+        ),
+        ({"max_env_restarts": 3}, "max_env_restarts 3 has no effect: on_env_fault is raise"),
+        (
+            {"clip_high": 0.3, "kl_beta": 0.1},
+            "clip_high 0.3 has no effect: kl_beta is 0.1, and it needs none",
+        ),
+    ],
+)
+def test_settings_without_an_effect_are_told(values: dict[str, Any], words: str, tmp_path: Path) -> None:
+    said: list[str] = []
+    agent = tightrope.PPO("CartPole-v1", **{**SMALL, **values}, notify=said.append)
+    assert [text for text in said if words in text]
+    agent.close()
+    settings = resolve("CartPole-v1", "ppo", {**SMALL, **values, "total_steps": 64})
+    warned: list[Any] = []
+    train(settings, run_dir=tmp_path / "run", listeners=[warned.append])
+    assert [e for e in warned if words in getattr(e, "text", "") and e.level == "warning"]
+
+
+def test_settings_with_an_effect_are_not_told() -> None:
+    said: list[str] = []
+    tightrope.PPO("CartPole-v1", **SMALL, kl_beta=0.1, kl_adapt=0.01, notify=said.append).close()
+    tightrope.PPO("Pendulum-v1", **SMALL, std="gsde", gsde_steps=4, notify=said.append).close()
+    assert said == []
+    assert AlignSettings().without_effect() == RewardSettings().without_effect() == []
+    assert AlignSettings(kl_horizon=5.0).without_effect() == [
+        "kl_horizon 5.0 has no effect: kl_goal is none, and it needs a value."
+    ]
+    assert SFTSettings(tune="full", lora_rank=4).without_effect()
+
+
+@pytest.mark.parametrize("tiny", [{"value_clip": 1e-8}, {"clip": 1e-9}, {"target_kl": 1e-20}])
+def test_ties_at_a_tiny_clip_are_no_difference_of_the_engines(tiny: dict[str, float]) -> None:
+    agent = tightrope.PPO("CartPole-v1", **{**SMALL, "engine": "fused"}, **tiny, notify=lambda text: None)
+    agent.learn(128)
+    agent.close()
 
 
 @pytest.mark.parametrize("steps", [1, 0, -5])
@@ -335,6 +393,11 @@ def test_what_a_task_prints_does_not_reach_the_json(tmp_path: Path, backend: str
         (["--num-envs", "1e308", "--dry-run"], "num_envs is a number of more than 30 digits"),
         (["--env-timeout", "1e308"], r"env_timeout is 1e+308; expected 0 < x <= 1e+09"),
         (["--adam-eps", "1e308"], "adam_eps is 1e+308; expected 0 < x <= 1"),
+        (["--evaluate-every", "5e-324"], "evaluate_every is 5e-324; expected 0, or a size"),
+        (["--num-epochs", "1e-400"], "'1e-400' is not a whole number"),
+        (["--num-epochs", "1e999999999"], "'1e999999999' is not a whole number"),
+        (["--num-steps", "1e9"], "Choose a smaller num_envs or num_steps"),
+        (["--hidden", "1e6", "1e6"], "Choose a smaller hidden"),
     ],
 )
 def test_empty_words_and_numbers_without_a_meaning(

@@ -29,7 +29,7 @@ from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 from tightrope.language.settings import RECIPES, AlignSettings, ModelSettings, RewardSettings, SFTSettings
 from tightrope.runs.folders import command_of
 from tightrope.runs.records import retyped
-from tightrope.settings.values import Settings, rule_of
+from tightrope.settings.values import ORIGINS, Settings, rule_of
 
 PROGRAM = "tightrope"
 
@@ -52,7 +52,6 @@ GROUPS = {
 }
 
 Options = dict[str, Any]
-ORIGINS = "origins"  # what --dry-run adds to the settings; a settings file may hold it
 SETTINGS_CLASSES: dict[str, type[Settings]] = {
     "train": TrainSettings,
     "sft": SFTSettings,
@@ -435,9 +434,7 @@ def _settings_in(path: str) -> Any:
     if not file.is_file():
         raise UsageError(f"--settings {path}: there is no such file. Give RUN/settings.json.")
     found = read_json(file)
-    if not isinstance(found, dict):
-        return found
-    return {name: value for name, value in unsigned(found).items() if name != ORIGINS}
+    return unsigned(found) if isinstance(found, dict) else found
 
 
 def _values_of_file(command: str, path: str) -> Options:

@@ -12,6 +12,9 @@ from tightrope.settings.fields import kinds, typed, validate
 from tightrope.settings.peer_names import PEER_NAMES
 
 
+ORIGINS = "origins"  # where each value came from, as --dry-run shows it beside the settings; not read
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """Frozen values that are checked on creation. A field ``update`` holds those of the update rule, whose
@@ -119,6 +122,7 @@ def _flat(kind: type[Settings], data: Any) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ValueError(f"the settings are {type(data).__name__}, expected an object with names and values.")
     outer = {name: value for name, value in data.items() if name != "update" or name not in names(kind)}
+    outer.pop(ORIGINS, None)
     values = _read(kind, outer)
     rule = rule_of(kind, values.get("algorithm"))
     if rule is None:

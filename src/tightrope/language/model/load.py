@@ -240,6 +240,8 @@ def _refuse_links(path: Path) -> None:
                 f"{entry} is a link to {entry.resolve()}, outside the model's folder, where nothing is read. "
                 "Put the file itself there."
             )
+        if not (entry.is_file() or entry.is_dir()):  # a pipe, whose reader would wait for ever
+            raise ValueError(f"{entry} is not a regular file. Take it out of the model's folder.")
 
 
 def _plain(name: Any) -> bool:
