@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -181,7 +180,7 @@ def test_a_dry_run_tells_where_each_value_comes_from(
         "total_steps": "preset", "normalise_rewards": "preset", "clip_high": "default", "hidden": "default",
     }  # fmt: skip
     assert {name: found[name] for name in told} == told
-    code, out, _ = run_main(capsys, "train", "LunarLander-v3", "--num-envs", "4", "--dry-run")
+    _, out, _ = run_main(capsys, "train", "LunarLander-v3", "--num-envs", "4", "--dry-run")
     (tmp_path / "settings.json").write_text(out)  # what was printed can be run
     again = origins(capsys, "train", "--settings", str(tmp_path), "--gamma", "0.9")
     assert (again["num_envs"], again["hidden"], again["gamma"]) == ("settings file", "settings file", "flag")

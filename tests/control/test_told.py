@@ -1,4 +1,4 @@
-"""What a run tells about its episodes and evaluations: means, successes, cuts, and the row of the last one."""
+"""What a run tells about its episodes and evaluations: means, successes, cuts, the row of the last one."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Goal(gym.Env):
         return np.zeros(1, np.float32), 1.0, end and not self.truncates, end and self.truncates, info
 
 
-# ----------------------------------------------------------------------------------------------- the episodes
+# --------------------------------------------------------------------------------------------- the episodes
 
 
 def test_means_are_of_the_last_100_episodes_and_never_missing_once_one_ended() -> None:
@@ -98,9 +98,8 @@ def test_means_of_the_last_episodes_are_resumed_exactly(tmp_path: Path) -> None:
 @pytest.mark.parametrize("backend", ["serial", "workers"])
 @pytest.mark.parametrize("truncates", [False, True])
 def test_successes_of_single_environments(backend: str, truncates: bool) -> None:
-    agent = tightrope.PPO(
-        lambda: Goal(truncates=truncates), **SMALL, vector_backend=backend, num_workers=2 if backend == "workers" else None
-    )  # fmt: skip
+    how = {"vector_backend": backend, "num_workers": 2 if backend == "workers" else None}
+    agent = tightrope.PPO(lambda: Goal(truncates=truncates), **SMALL, **how)
     try:
         updates = list(agent.iterate(320))
     finally:
@@ -147,7 +146,7 @@ def test_a_success_that_is_no_number_is_named() -> None:
         tightrope.PPO(Odd, **SMALL).learn(64)
 
 
-# ---------------------------------------------------------------------------------------------- the evaluation
+# ------------------------------------------------------------------------------------------- the evaluation
 
 
 class Endless(gym.Env):
@@ -297,7 +296,7 @@ def test_evaluate_takes_the_limit(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "4 of 4 evaluation episodes had not ended after 3 steps" in printed.err
 
 
-# ----------------------------------------------------------------------------------------------- the first ratio
+# ------------------------------------------------------------------------------------------ the first ratio
 
 
 class Dropped(torch.nn.Module):

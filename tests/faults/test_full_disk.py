@@ -132,11 +132,15 @@ def test_the_command_line_prints_one_message(
         words += [f"--{name.replace('_', '-')}", "none" if value is None else str(value)]
     with monkeypatch.context() as patch:
         refusing(patch, {2})
-        assert main(words) == 2
+        assert main(words) == 74  # EX_IOERR: not the code of a mistake in the words
     seen = capsys.readouterr()
     assert seen.out == ""
     assert seen.err.count("\n") == 1 and "Traceback" not in seen.err
-    assert "cannot be written (No space left on device)" in seen.err and "tightrope resume" in seen.err
+    assert "cannot be written (No space left on device)" in seen.err
+    assert (
+        f"Make room on the disk and try again; the run continues with: tightrope resume {tmp_path}/run"
+        in seen.err
+    )
     with Run.open(tmp_path / "run").lock():
         assert main(["resume", str(tmp_path / "run"), "--quiet"]) == 2
     assert "is being written by this process" in capsys.readouterr().err

@@ -28,6 +28,19 @@ class NonFiniteError(TightropeError, FloatingPointError):
     """A NaN or an infinity was met before a step; the weights are as they were before that step."""
 
 
+def require_restorable(name: str, saved: Tensor, like: Tensor, *, at_least: float = -math.inf) -> None:
+    """ValueError for a saved tensor that is not of the shape and type of the one it is for, or that holds a
+    number that is not finite or below ``at_least``.
+    """
+    if saved.shape != like.shape or saved.dtype != like.dtype:
+        kinds = [f"{str(x.dtype).removeprefix('torch.')} {tuple(x.shape)}" for x in (saved, like)]
+        raise ValueError(f"{name} is {kinds[0]}, expected {kinds[1]}")
+    if saved.is_floating_point() and saved.numel():
+        low, high = map(float, saved.aminmax())
+        if not (math.isfinite(low) and math.isfinite(high) and low >= at_least):
+            raise ValueError(f"{name} holds {low if not low >= at_least else high}, expected finite numbers")
+
+
 def explain(
     model: Any,
     optimiser: torch.optim.Optimizer,

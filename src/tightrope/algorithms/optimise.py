@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from tightrope.algorithms.nonfinite import require_restorable
 from tightrope.algorithms.settings import UpdateSettings
 
 
@@ -66,8 +68,9 @@ def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, Tenso
     for name, saved in tensors.items():
         index, kind = name.split(".", 1)
         parameter = parameters[int(index)]
-        if saved.shape != (() if kind == "step" else parameter.shape):
-            raise ValueError(f"{name} of the optimiser has shape {tuple(saved.shape)}")
+        like = torch.zeros(()) if kind == "step" else parameter
+        low = -math.inf if kind == "exp_avg" else 0.0
+        require_restorable(f"{name} of the optimiser", saved, like, at_least=low)
         entry = optimiser.state[parameter]
         if kind in entry:
             entry[kind].copy_(saved)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ import torch
 
 from tightrope.algorithms import ppo
 from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.nonfinite import require_restorable
 from tightrope.algorithms.optimise import (
     make_optimiser,
     optimiser_tensors,
@@ -323,6 +325,8 @@ class Agent:
 
     def restore(self, tensors: Tensors, state: dict[str, Any]) -> None:
         """Put back what `snapshot` gave, into an agent of the same settings."""
+        for name, parameter in self.policy.named_parameters():
+            require_restorable(name, tensors["policy"][name], parameter)
         self.policy.load_state_dict(tensors["policy"])
         restore_optimiser(self.optimiser, tensors["optimiser"])
         normalisers = dict(tensors.get("normalisers", {}))
@@ -331,10 +335,12 @@ class Agent:
             normalisers["rewards.running"] = torch.zeros(self.environments.num_envs, dtype=torch.float64)
         self.normalisers.load(normalisers)
         beta = state["kl_beta"]
-        self.steps = int(state["steps"])
+        self.steps = checkpoint.counted(state["steps"])
         self.kl_beta = None if beta is None else float(beta)
-        self.rollbacks = int(state.get("rollbacks", 0))  # missing in old runs
-        self.collector.count_from(max(0, int(state.get("environment_restarts", 0))))
+        if self.kl_beta is not None and not 0 <= self.kl_beta < math.inf:
+            raise ValueError(f"kl_beta is {self.kl_beta}")
+        self.rollbacks = checkpoint.counted(state.get("rollbacks", 0))  # missing in old runs
+        self.collector.count_from(checkpoint.counted(state.get("environment_restarts", 0)))
         self.episodes.restore(state.get("finished_episodes", {}))  # missing in old runs
         self.sampling_rng.bit_generator.state = state["rng"]["sampling"]
         self.update_rng.bit_generator.state = state["rng"]["update"]

@@ -172,6 +172,14 @@ def verify(folder: Path) -> None:
     _steadily(Path(folder), check)
 
 
+def counted(value: Any) -> int:
+    """A count in a saved state. ValueError for what is none, or does not fit 64 bits."""
+    number = int(value)
+    if not 0 <= number < 2**63:
+        raise ValueError(f"{str(number)[:30]} is no count")
+    return number
+
+
 @contextlib.contextmanager
 def understood(folder: Path) -> Iterator[None]:
     """Turns errors about a wrong state or wrong tensors into a CheckpointError: a manifest protects against

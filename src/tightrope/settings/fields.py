@@ -128,7 +128,7 @@ def _check_range(field: dataclasses.Field[Any], value: Any) -> None:
         if not inside or not held:
             expected = range_text(limits) or "a finite number"
             if inside and math.isfinite(number):
-                expected = f"0, or a size between {SMALLEST_FLOAT:g} and {LARGEST_FLOAT:g} (float32)"
+                expected = f"a size between {SMALLEST_FLOAT:g} and {LARGEST_FLOAT:g} (float32)"
             raise ValueError(f"{field.name} is {value!r}; expected {expected}. Choose a value in that range.")
 
 

@@ -11,7 +11,6 @@ from typing import Any, Self
 from tightrope.settings.fields import kinds, typed, validate
 from tightrope.settings.peer_names import PEER_NAMES
 
-
 ORIGINS = "origins"  # where each value came from, as --dry-run shows it beside the settings; not read
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from tightrope.algorithms.nonfinite import require_restorable
 from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
 
 Tensors = dict[str, dict[str, Tensor]]
@@ -23,6 +24,9 @@ def restore_tensors(
     tensors: Tensors, parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer
 ) -> None:
     """Copy what `tensors_of` gave into the same parameters and their optimiser."""
+    saved = [tensors["trained"][f"{index:05d}"] for index in range(len(parameters))]
     for index, parameter in enumerate(parameters):
-        parameter.copy_(tensors["trained"][f"{index:05d}"])
+        require_restorable(f"trained tensor {index}", saved[index], parameter)
+    for index, parameter in enumerate(parameters):
+        parameter.copy_(saved[index])
     restore_optimiser(optimiser, tensors["optimiser"])

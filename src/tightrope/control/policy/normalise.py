@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
 
+from tightrope.algorithms.nonfinite import require_restorable
 from tightrope.control.spaces import Array, Inputs
 from tightrope.maths.statistics import RunningMoments
 
@@ -138,6 +140,6 @@ class Normalisers:
                 prefix = f"{kind}."
                 found = {k.removeprefix(prefix): x for k, x in state.items() if k.startswith(prefix)}
                 for name, own in part.state().items():
-                    if found[name].shape != own.shape or found[name].dtype != own.dtype:
-                        raise ValueError(f"{prefix}{name} is {found[name].dtype} {tuple(found[name].shape)}")
+                    low = 0.0 if name in ("count", "variance") else -math.inf
+                    require_restorable(f"{prefix}{name}", found[name], own, at_least=low)
                 part.load(found)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tightrope.control.rollout.rollout import Rollout
+from tightrope.runs.checkpoint import counted
 
 RECENT = 100  # episodes that rollout/ep_rew_mean and its like are means of, as in stable-baselines3
 
@@ -48,8 +49,12 @@ class FinishedEpisodes:
     def restore(self, state: dict[str, Any]) -> None:
         """Put back a `state`; an empty one is that of an older version."""
         longest = state.get("longest")
-        self.longest = math.inf if longest is None else int(longest)
+        self.longest = math.inf if longest is None else counted(longest)
+        newest = [(float(total), counted(length)) for total, length in state.get("newest", [])]
+        successes = [float(success) for success in state.get("successes", [])]
+        if not np.isfinite([*(total for total, _ in newest), *successes]).all():
+            raise ValueError("a return or a success of the finished episodes is not finite")
         self._newest.clear()
-        self._newest.extend((float(total), int(length)) for total, length in state.get("newest", []))
+        self._newest.extend(newest)
         self._successes.clear()
-        self._successes.extend(map(float, state.get("successes", [])))
+        self._successes.extend(successes)

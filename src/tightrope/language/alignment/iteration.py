@@ -49,7 +49,7 @@ from tightrope.language.reward.judge import (
 )
 from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.maths.values import explained_variance
-from tightrope.runs.checkpoint import understood
+from tightrope.runs.checkpoint import counted, understood
 from tightrope.runs.records import figures
 from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
@@ -59,7 +59,8 @@ from tightrope.training.parameters import Tensors, restore_tensors, tensors_of
 
 # what a checkpoint holds of a trainer as it is, and how it is read back
 SAVED: dict[str, Callable[[Any], Any]] = {
-    "episodes": int, "iteration": int, "kl_beta": float, "stopped": bool, "seconds": float, "newest": figures,
+    "episodes": counted, "iteration": counted, "kl_beta": float, "stopped": bool, "seconds": float,
+    "newest": figures,
 }  # fmt: skip
 
 
@@ -233,9 +234,9 @@ class Trainer:
             restore_tensors(tensors, self.roles.parameters(), self.optimiser)
             for name, read in SAVED.items():
                 setattr(self, name, read(state[name]))
-            self.rollbacks = int(state.get("rollbacks", 0))
+            self.rollbacks = counted(state.get("rollbacks", 0))
             self.micro_batch_size = state.get("micro_batch_size", self.micro_batch_size)
-            self.order.position = int(state["prompt_position"])
+            self.order.position = counted(state["prompt_position"])
             self.update_rng.bit_generator.state = state["rng"]["update"]
             self.monitor.restore(state["monitor"])
             if self.pretraining is not None:

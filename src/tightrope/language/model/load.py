@@ -27,6 +27,7 @@ UNPICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 INDEX = "model.safetensors.index.json"
 # keys of config.json whose text may look like a path: transformers stores it and opens nothing
 TEXTS = ("_name_or_path", "name_or_path", "id2label", "label2id", "task_specific_params", "chat_template")
+MOST_LAYERS = 10_000
 # how experts are computed: other words have transformers fetch a kernel. Attention is chosen by `fused`.
 EXPERTS = (None, "eager", "batched_mm", "grouped_mm")
 
@@ -147,8 +148,21 @@ def pretrained(kind: Any, folder: str | Path, **options: Any) -> Any:
 
 
 def without_weights(kind: Any, config: Any, **options: Any) -> Any:
-    """``kind.from_config(config)`` for any of transformers' Auto classes; no code of a folder is run."""
-    return kind.from_config(config, trust_remote_code=False, **options)
+    """``kind.from_config(config)`` for any of transformers' Auto classes; no code of a folder is run.
+    ValueError, with the reason, for a configuration of which no model can be built.
+    """
+    try:
+        return kind.from_config(config, trust_remote_code=False, **options)
+    except MemoryError:
+        raise
+    except Exception as error:
+        if "scaled_dot_product_attention" in str(error):  # `fused` asks for another kind of attention
+            raise
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise ValueError(
+            f"config.json describes no model that can be built ({type(error).__name__}: {reason}). Is it "
+            "whole, and of an architecture that transformers knows?"
+        ) from error
 
 
 def refuse_code(folder: str | Path) -> None:
@@ -263,6 +277,8 @@ def _refuse_in_config(path: Path, value: Any, key: str = "") -> None:
     elif isinstance(value, list):
         for part in value:
             _refuse_in_config(path, part, key)
+    elif isinstance(value, int) and not isinstance(value, bool):
+        _refuse_size(path, key, value)
     elif "experts_implementation" in key and value not in EXPERTS:
         raise ValueError(f"{path} has {key} {value!r}; expected one of {EXPERTS}. Take it out of the file.")
     elif isinstance(value, str) and value and not _plain(value):
@@ -270,6 +286,18 @@ def _refuse_in_config(path: Path, value: Any, key: str = "") -> None:
             f"{path} has {key} {value!r}, which may name a place or code elsewhere. Nothing of the kind is "
             "followed: take it out of the file where you trust the model."
         )
+
+
+def _refuse_size(path: Path, key: str, value: int) -> None:
+    """ValueError for a number of layers that would never be built, and for sizes that are none."""
+    layers = key in ("num_hidden_layers", "n_layer", "num_layers", "n_layers")
+    size = layers or key.endswith(
+        ("_size", "_heads", "head_dim", "_embd", "_positions", "_embeddings", "_window")
+    )
+    low, high = (1, MOST_LAYERS) if layers else (0, 2**31) if size else (-(2**63), 2**63 - 1)
+    if not low <= value <= high:
+        digits = str(value) if abs(value) < 10**30 else "a number of more than 30 digits"
+        raise ValueError(f"{path}: {key} is {digits}; expected {low} to {high}. Choose another model.")
 
 
 def _refuse_file_names(path: Path, value: Any) -> None:

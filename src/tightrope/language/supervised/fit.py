@@ -23,7 +23,7 @@ from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam
 from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
-from tightrope.runs.checkpoint import understood
+from tightrope.runs.checkpoint import counted, understood
 from tightrope.runs.records import figures
 from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
@@ -163,16 +163,16 @@ class SupervisedLearner:
             )
         items = len(self.objective.items)
         with understood(folder):
-            step, before = int(state["step"]), state["items"]
+            step, before = counted(state["step"]), state["items"]
             newest = figures(state["newest"])
             if before == items:
                 restore_tensors(tensors, self.parameters, self.optimiser)
             self.step = step
-            self.seen = int(state["seen"])
+            self.seen = counted(state["seen"])
             self.seconds = float(state["seconds"])
             self.newest = newest
             self.micro_batch_size = state["micro_batch_size"]
-            self.rollbacks = int(state.get("rollbacks", 0))
+            self.rollbacks = counted(state.get("rollbacks", 0))
         if before != items:
             raise ValueError(
                 f"{folder.parent.parent} was learning from {before} examples, the data now have {items}. "
