@@ -143,13 +143,11 @@ class Descent:
         self.meter.forget("approx_kl")
 
     @torch.no_grad()
-    def kl_after(self, batch: Batch, size: int) -> float:
-        """k3 of the batch under the model as it is now, mean over counting steps; ``size`` rows a pass."""
-        sums = []
+    def measure_after(self, batch: Batch, size: int) -> None:
+        """Add the metric kl_after: k3 of the batch under the model as it is now; ``size`` rows a pass."""
         for part in batch.split(min(size, self.micro_batches.size or size)):
             log_ratio = surrogate.log_ratio(self.model(part).logp, part.old_logp, part.mask)
-            sums.append(statistics.masked_sum(divergence.k3(log_ratio), part.mask))
-        return float(torch.stack(sums).sum() / batch.mask.sum())
+            self.meter.add(part.mask, kl_after=divergence.k3(log_ratio))
 
     def halted(self) -> bool:
         """Whether to stop, waiting for an accelerator; NonFiniteError when the last gradient was bad."""

@@ -91,7 +91,6 @@ def update(
                 break
         if descent.halted():
             break
-    metrics = descent.metrics()
     if settings.kl_beta is not None and settings.kl_adapt is not None:
-        metrics["train/kl_after"] = descent.kl_after(batch, settings.minibatch_size)
-    return metrics
+        descent.measure_after(batch, settings.minibatch_size)
+    return descent.metrics()

@@ -30,10 +30,9 @@ from tightrope.control.environments.faults import first_unusable, policy_of
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
-from tightrope.control.memory import require_fit
 from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
 from tightrope.control.policy.policy import Policy
-from tightrope.control.resolve import resolve
+from tightrope.control.resolve import require_room, resolve
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.episodes import FinishedEpisodes
 from tightrope.control.rollout.rollout import to_batch
@@ -70,12 +69,12 @@ class Agent:
     ) -> None:
         self.settings = settings or resolve(env, self.algorithm, values)
         self.env = env
-        require_fit(self.settings)
+        require_room(self.settings)
         self.environments = _environments(env, self.settings)
         present = self.settings
         torch_device = usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
-        self._require_fit(present, policy)
+        self._require_room(present, policy)
         threads = present.threads or (available_cores() if layouts[0].image_shapes else 1)
         with limited_threads(threads):  # the QR of the first weights rounds differently with more threads
             self.policy = Policy(*layouts, present, policy).to(torch_device)
@@ -110,11 +109,11 @@ class Agent:
             if not box and getattr(settings, name) != value
         ]
 
-    def _require_fit(self, settings: TrainSettings, policy: Any) -> None:
+    def _require_room(self, settings: TrainSettings, policy: Any) -> None:
         environments = self.environments
         layouts = (environments.observation_layout, environments.action_layout)
         try:
-            require_fit(settings, *layouts, own_policy=policy is not None)
+            require_room(settings, *layouts, own_policy=policy is not None)
         except DoesNotFit:
             environments.close()
             raise

@@ -116,8 +116,7 @@ class TrainSettings(Settings):
     )
     evaluation_max_steps: int | None = setting(
         None,
-        "Steps after which an evaluation episode is cut; none: the time limit, at least 1,000 and twice the "
-        "longest episode that ended in training.",
+        "Steps after which an evaluation episode is cut; none: by the training episodes.",
         at_least=1,
     )
     checkpoint_every: float | None = setting(

@@ -34,8 +34,7 @@ from tightrope.control.environments.faults import (
     wait_before_restart,
 )
 from tightrope.control.environments.masks import find_source, vector_masks
-from tightrope.control.environments.success import KEY as SUCCESS
-from tightrope.control.environments.success import vector_success
+from tightrope.control.environments.success import SUCCESS_KEY, vector_success
 from tightrope.control.environments.watchdog import Watchdog
 from tightrope.control.spaces import Inputs, action_layout, observation_layout
 
@@ -199,7 +198,7 @@ class VectorEnvironments(Environments):
         rewards, terminated, truncated = self._check(rewards, terminated, truncated)
         inputs = self._encode(observations)
         success = None
-        if "final_info" in infos or SUCCESS in infos:
+        if "final_info" in infos or SUCCESS_KEY in infos:
             success = vector_success(infos, (terminated | truncated) & ~self._ended)
         if self.mode == AutoresetMode.NEXT_STEP:
             phantom = self._ended if self._any_ended else None
