@@ -39,9 +39,9 @@ def main() -> None:
     """Train on the torch path, which takes any module, and load the policy again."""
     agent = tightrope.PPO("CartPole-v1", policy=build, seed=1)
     returns = [
-        report.metrics["rollout/ep_rew_mean"]
+        report.metrics["rollout/new_ep_rew_mean"]
         for report in agent.iterate(30_720)
-        if "rollout/ep_rew_mean" in report.metrics
+        if "rollout/new_ep_rew_mean" in report.metrics
     ]
     print("return of the first and of the last rollout:", returns[0], returns[-1])
     assert returns[-1] > 3 * returns[0]
