@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -199,3 +200,25 @@ def test_readers_read_while_it_is_written(path: Path) -> None:
         point = run.resume_point(print, print)
         run.rewind(point)
         assert run.read_metrics()[-1]["step"] == point.state["step"]
+
+
+def test_a_killed_writer_with_the_number_of_this_process_is_not_called_this_process(path: Path) -> None:
+    """In containers every run is process 1."""
+    note = {"pid": os.getpid(), "host": "box", "started": "2026-01-01 00:00:00"}
+    (path / "writer.lock").write_text(json.dumps(note))
+    told: list[str] = []
+    with Run.open(path, own=True) as run:
+        run.resume_point(told.append, told.append)
+    assert told == [
+        f"the run was left without an end by process {os.getpid()} on box since 2026-01-01 00:00:00"
+    ]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "file"])
+def test_a_run_folder_that_is_no_folder(tmp_path: Path, kind: str) -> None:
+    place = tmp_path / "run"
+    os.mkfifo(place) if kind == "pipe" else place.write_text("x")
+    with pytest.raises(ValueError, match="run is there and is not a folder. Give another --run-dir"):
+        Run.create(place, {}, "name")
+    with pytest.raises(ValueError, match="is not a run folder: it is not a folder"):
+        Run.open(place)

@@ -31,6 +31,7 @@ _ADVICE = {
     errno.EROFS: "The disk is read-only: have it mounted for writing",
     errno.EACCES: "Give yourself the permission to write there",
     errno.ENOENT: "If it was renamed, give it its name back",
+    errno.ENOTDIR: "A part of the path is a file: give another path",
     errno.EPERM: "Give yourself the permission to write there",
 }
 

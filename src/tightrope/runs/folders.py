@@ -36,8 +36,9 @@ def require_kind(path: Path, settings: dict[str, Any], command: str) -> None:
 
 def require_free(path: Path) -> None:
     """ValueError unless a run can be created here: the path is free, or a folder with only a lock in it."""
-    inside = path.iterdir() if path.is_dir() else ()
-    if (path.exists() and not path.is_dir()) or any(entry.name != NAME for entry in inside):
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"run_dir {path} is there and is not a folder. Give another --run-dir.")
+    if path.is_dir() and any(entry.name != NAME for entry in path.iterdir()):
         raise ValueError(
             f"run_dir {path} exists and is not empty; a run is never overwritten. "
             f"Give another --run-dir, delete the folder, or continue with: tightrope resume {path}"
@@ -59,7 +60,8 @@ def fresh(parent: Path, name: str) -> Path:
 
 def why_not(path: Path) -> str:
     """Why a path is not a run folder, and which similar one is."""
-    reason = "it holds no settings.json." if path.is_dir() else "there is no such folder."
+    reason = "it is not a folder." if path.exists() else "there is no such folder."
+    reason = "it holds no settings.json." if path.is_dir() else reason
     inside = _runs_in(path)
     if inside:
         return f"{reason} Its newest run is {inside[-1]}."

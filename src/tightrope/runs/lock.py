@@ -67,7 +67,7 @@ class WriterLock:
                 "else writes there.",
                 stacklevel=4,
             )
-        self.left_by = _described(_note(self._path))
+        self.left_by = _described(_note(self._path), ended=True)
         here = {
             "pid": os.getpid(),
             "host": socket.gethostname(),
@@ -125,8 +125,9 @@ def _note(path: Path) -> dict[str, Any]:
     return note if isinstance(note, dict) else {}
 
 
-def _described(note: dict[str, Any]) -> str:
+def _described(note: dict[str, Any], *, ended: bool = False) -> str:
     if "pid" not in note:
         return ""
-    who = "this process" if note["pid"] == os.getpid() else f"process {note['pid']}"
+    # in containers a process that ended often had the number that this one has
+    who = "this process" if note["pid"] == os.getpid() and not ended else f"process {note['pid']}"
     return f"{who} on {note.get('host')} since {note.get('started')}"

@@ -188,3 +188,11 @@ def test_choice_without_a_second_thread():
     assert not choice.choose()
     choice.record(False, 1.0, 1)
     assert not choice.choose()
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"a\x00b", b"../none", None])
+def test_a_list_of_entries_that_is_none_means_that_compilation_is_due(content, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    place = cache.cache_folder() / "complete"
+    place.mkdir() if content is None else place.write_bytes(content)
+    assert cache.compilation_due()

@@ -132,9 +132,12 @@ def compilation_due() -> bool:
     """Whether importing the engine will compile it (many seconds) instead of reading the cache (under
     one)."""
     folder = cache_folder()
-    if folder is None or not (folder / _COMPLETE).exists():
+    try:
+        return folder is None or not all(
+            (folder / name).exists() for name in (folder / _COMPLETE).read_text().split()
+        )
+    except (OSError, ValueError):  # it is not there, or it is no list of names
         return True
-    return not all((folder / name).exists() for name in (folder / _COMPLETE).read_text().split())
 
 
 def when_compiled() -> str:
