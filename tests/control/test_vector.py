@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -247,6 +249,20 @@ def test_closing_twice_and_closing_what_was_made():
     environments.close()
     environments.close()
     assert len(made) == 3 and all(env.closed for env in made)
+
+
+def test_a_factory_that_cannot_be_sent_to_a_worker_is_named(monkeypatch):
+    """Where workers are spawned it is pickled; what it holds may not be."""
+    context = multiprocessing.get_context("spawn")
+    monkeypatch.setattr("tightrope.control.environments.pool.start_context", lambda: context)
+    held = threading.Lock()
+
+    def make():
+        with held:
+            return gym.make("CartPole-v1")
+
+    with pytest.raises(ValueError, match="cannot be sent to a worker process .*lock.*vector_backend serial"):
+        make_environments(make, 2, backend="workers", num_workers=2)
 
 
 def test_workers_start_by_spawn_where_there_is_no_fork(monkeypatch):

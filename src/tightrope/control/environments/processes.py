@@ -101,7 +101,18 @@ class WorkerProcess:
         with warnings.catch_warnings():
             # Python 3.12 warns of fork beside threads; start_context explains why it is safe here
             warnings.filterwarnings("ignore", message=".*multi-threaded.*fork", category=DeprecationWarning)
-            self._process.start()
+            try:
+                self._process.start()
+            except Exception as error:  # what a factory holds may raise anything when it is pickled
+                theirs.close()
+                self._socket.close()
+                if isinstance(error, OSError):
+                    raise
+                raise ValueError(
+                    f"The factory of {name} cannot be sent to a worker process ({error}). Make the "
+                    "environment from what a module defines, without locks, files or connections around it, "
+                    "or use vector_backend serial."
+                ) from error
         theirs.close()
 
     def send(self, command: bytes, number: int = 0, data: bytes = b"") -> None:
