@@ -141,6 +141,20 @@ def test_an_observation_that_is_not_finite_gives_no_action_and_no_value(
                 ask(np.asarray(given, np.float32))
 
 
+@pytest.mark.parametrize("given", [None, [], "x", {}, [[0.0] * 4, [0.0]], [None] * 4, [0.0] * 3])
+def test_what_is_no_observation_is_named(agent: tightrope.PPO, given: Any) -> None:
+    for ask in (agent.predict, agent.value):
+        with pytest.raises(ValueError, match=r"bservation.* (is|has shape) .*Box"):
+            ask(given)
+
+
+def test_what_is_no_dict_of_observations_is_named() -> None:
+    agent = tightrope.PPO(lambda: Named("speed", "angle"), **SMALL)
+    for given in (None, [1.0], {"speed": [0.0]}, 3.0):
+        with pytest.raises(ValueError, match=r"bservation.*(Dict|angle)"):
+            agent.predict(given)
+
+
 @pytest.mark.parametrize("mask", [[-np.inf, 0.0], [0, 2], [0.5, 1.0], [np.nan, 1.0]])
 def test_a_mask_of_other_numbers_than_0_and_1(agent: tightrope.PPO, mask: list[float]) -> None:
     """bool(-inf) is True: an additive mask would allow what it means to forbid."""

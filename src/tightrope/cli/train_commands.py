@@ -214,6 +214,10 @@ def _print_returns(summary: dict[str, Any], final: dict[str, Any], run: str | No
     if mean is not None:
         spread = f" ± {display.number(deviation)}" if deviation is not None else ""
         over = f" over {count:.0f} episodes" if count else ""
+        if cut := final.get("eval/cut_episodes"):
+            over += f", {cut:.0f} of them cut"
+        if (rate := final.get("eval/success_rate")) is not None:
+            over += f", success rate {rate:.2f}"
         print(f"evaluation   mean return {display.number(mean)}{spread}{over}", file=stream)
     if steps is not None and seconds:
         speed = f"{steps / seconds:,.0f} steps/s"

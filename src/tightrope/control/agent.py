@@ -459,10 +459,16 @@ def require_finite(inputs: Inputs) -> Inputs:
 
 def _is_batched(layout: ObservationLayout, observation: Any) -> bool:
     """Whether an observation has one axis more than its space."""
-    leaf = layout.leaves[0]
-    for key in leaf.path:
-        observation = observation[key]
-    return np.ndim(observation) > len(leaf.space.shape or ())
+    leaf, part = layout.leaves[0], observation
+    try:
+        for key in leaf.path:
+            part = part[key]
+        return np.ndim(part) > len(leaf.space.shape or ())
+    except (LookupError, TypeError, ValueError) as error:  # no such key, no dict, rows of several lengths
+        raise ValueError(
+            f"The observation is {repr(observation)[:80]}; expected one of {layout.space}, or a batch of "
+            "them."
+        ) from error
 
 
 def _settings_metrics(present: UpdateSettings) -> dict[str, float]:
