@@ -105,7 +105,7 @@ def train_ours(
         "engine": settings["engine"],
         "backend": backend,
     }
-    found["optimiser_steps"] = round(sum(update["train/minibatches"] for update in updates))
+    found["optimiser_steps"] = round(sum(update.get("train/minibatches", 0) for update in updates))
     report.check_work(scenario, found, phantoms=backend == "vector")
     return found
 
