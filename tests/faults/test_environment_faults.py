@@ -281,7 +281,8 @@ def test_the_command_exits_with_2_and_a_reason(policy, code, capsys, tmp_path):
         del gym.registry["tightrope_tests/Frail-v0"]
     error = capsys.readouterr().err
     assert "RuntimeError: the simulator broke" in error and "tightrope_tests/Frail-v0" in error
-    assert ("max_env_restarts" in error) == (policy == "restart")
+    assert ("max_env_restarts allows no more" in error) == (policy == "restart")
+    assert ("max_env_restarts 2 has no effect" in error) == (policy == "raise")
 
 
 def test_restarts_are_in_the_metrics_of_a_run_and_episodes_are_none_of_them(tmp_path):
