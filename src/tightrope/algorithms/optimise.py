@@ -61,10 +61,14 @@ def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Adam's moments, copied in place where they exist: the compiled engine may hold views of them. Raises
-    ValueError for those of other parameters.
+    """Adam's moments, copied in place where they exist: the compiled engine may hold views of them. Those
+    that are not saved become 0, as before the first step. Raises ValueError for those of other parameters.
     """
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    for number, parameter in enumerate(parameters):
+        for kind, moment in optimiser.state.get(parameter, {}).items():
+            if f"{number}.{kind}" not in tensors:
+                moment.zero_()
     for name, saved in tensors.items():
         index, kind = name.split(".", 1)
         parameter = parameters[int(index)]

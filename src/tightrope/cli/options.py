@@ -44,6 +44,7 @@ GROUPS = {
         "evaluation_episodes",
         "evaluation_max_steps",
         "checkpoint_every",
+        "checkpoint_minutes",
         "keep_checkpoints",
         "tensorboard",
     ),

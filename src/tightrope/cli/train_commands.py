@@ -155,17 +155,20 @@ def farewell(error: BaseException, run: str | None, step: int, counted: str, com
     by = f" by {error}" if isinstance(error, signals.Stopped) else ""
     if run is None:
         return f"Stopped{by} before the run began."
-    text = f"Stopped{by} at {counted.removesuffix('s')} {step:,}. "
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # `resume` reports damaged checkpoints
             folder = Run.open(run).newest().folder
     except ValueError:
-        text += f"There is no checkpoint yet: all {step:,} {counted} will be repeated."
+        saved, text = 0, f"There is no checkpoint yet: all {step:,} {counted} will be repeated."
     else:
-        lost = max(0, step - checkpoint.step_of(folder))
-        text += f"The newest valid checkpoint is {folder}; {lost:,} {counted} since then will be repeated."
-    return f"{text} Go on with:\n  {command}"
+        saved = checkpoint.step_of(folder)
+        text = f"It is saved in {folder}; what was under way is repeated."
+        if saved < step:
+            lost = f"{step - saved:,} {counted} since then will be repeated"
+            text = f"The newest valid checkpoint is {folder}; {lost}."
+    at = f"{counted.removesuffix('s')} {max(step, saved):,}"
+    return f"Stopped{by} at {at}. {text} Go on with:\n  {command}"
 
 
 def _command(name: str, run: str, given: Options) -> str:

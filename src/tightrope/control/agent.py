@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import sys
@@ -39,11 +40,11 @@ from tightrope.control.rollout.rollout import to_batch
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces import Array, Inputs, ObservationLayout, structure
 from tightrope.maths.values import explained_variance
-from tightrope.runs import checkpoint
+from tightrope.runs import checkpoint, signals
 from tightrope.training.events import Message
 from tightrope.training.learner import Update, crosses
 from tightrope.training.memory import DoesNotFit
-from tightrope.training.parameters import Tensors
+from tightrope.training.parameters import Tensors, whole_update
 
 MIN_COLUMNS = 16  # ten epochs on fewer steps than this would only add noise to a finished policy
 
@@ -94,6 +95,7 @@ class Agent:
         self.changes: dict[str, Any] = {}  # of the update rule's settings, made by a listener
         self.episodes = FinishedEpisodes()
         self.fresh, self.notify = True, notify  # fresh: new episodes begin with the next rollout
+        self._update_seconds: float | None = None  # of the newest update
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
         if settings is None:
             for text in self.without_effect(present):
@@ -131,7 +133,8 @@ class Agent:
     def iterate(self, total_steps: int | None = None, *, start: int | None = None) -> Iterator[Update]:
         """Learn, one update at a time: ``for report in agent.iterate(n): ...``.
 
-        ``start``: the agent step at which this budget began (default: now).
+        ``start``: the agent step at which this budget began (default: now). Ctrl-C drops a rollout at once
+        and lets an update finish, or undoes a long one; the agent is then as it was between two updates.
         """
         budget = self.settings.total_steps if total_steps is None else total_steps
         if start is None and budget < self.environments.num_envs:
@@ -142,16 +145,41 @@ class Agent:
         start = self.steps if start is None else start
         every = self.settings.checkpoint_every
         while (columns := self._next_columns(budget, start)) > 0:
-            if self.fresh:
-                self.collector.reset(self.settings.seed, self.steps)
             before = self.steps - start
             # BLAS threads beside the engine's two only spin: its products are too small to share
-            with limited_threads(1 if self.engine.name == "fused" else self.settings.threads or 1):
-                metrics, episodes = self._one_update(columns, (self.steps - start) / budget)
-            after = self.steps - start
-            on_grid = crosses(before, after, budget, every)
-            self.fresh = on_grid and not self.environments.gives_state
+            threads = 1 if self.engine.name == "fused" else self.settings.threads or 1
+            with limited_threads(threads), self._whole_updates():
+                metrics, episodes = self._one_update(columns, before / budget)
+                after = self.steps - start
+                on_grid = crosses(before, after, budget, every)
+                self.fresh = on_grid and not self.environments.gives_state
             yield Update(after, budget, metrics, before, on_grid, episodes)
+
+    @contextlib.contextmanager
+    def _whole_updates(self) -> Iterator[None]:
+        """Around an update. What ends it before it is complete (a signal, a fault) drops its rollout: the
+        random generators go back to where they were, and new episodes begin with the next rollout.
+        """
+        generators = (self.sampling_rng, self.update_rng)
+        with signals.stoppable(only_ctrl_c=True), signals.uninterrupted():
+            before = [rng.bit_generator.state for rng in generators]
+            try:
+                yield
+            except BaseException:
+                for rng, state in zip(generators, before, strict=True):
+                    rng.bit_generator.state = state
+                self.collector.drop()
+                self.fresh = True
+                raise
+
+    def _learned(self) -> Tensors:
+        """What an update changes in place."""
+        return {"policy": dict(self.policy.state_dict()), "optimiser": optimiser_tensors(self.optimiser)}
+
+    def _unlearn(self, tensors: Tensors) -> None:
+        """Put back what `_learned` gave."""
+        self.policy.load_state_dict(tensors["policy"])
+        restore_optimiser(self.optimiser, tensors["optimiser"])
 
     def _next_columns(self, budget: int, start: int) -> int:
         """Columns of the next rollout, within the budget; 0 when too few are left to learn from."""
@@ -168,18 +196,22 @@ class Agent:
             present = present.unchecked(kl_beta=self.kl_beta)
         set_learning_rates(self.optimiser, present)
         begin = time.perf_counter()
-        rollout = self.collector.collect(self.engine, columns)
+        with signals.interruptible():
+            if self.fresh:
+                self.collector.reset(self.settings.seed, self.steps)
+            rollout = self.collector.collect(self.engine, columns)
         collected = time.perf_counter()
         batch = to_batch(rollout, self.engine, self.normalisers, present)
         metrics: dict[str, float] = {}
         if bool(batch.mask.any()):
-            metrics = self.engine.update(
-                batch,
-                present,
-                self.update_rng,
-                refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
-                log_ratio_limit=self._log_ratio_limit(batch),
-            )
+            with whole_update(self._update_seconds, self._learned, self._unlearn):
+                metrics = self.engine.update(
+                    batch,
+                    present,
+                    self.update_rng,
+                    refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
+                    log_ratio_limit=self._log_ratio_limit(batch),
+                )
             metrics["train/explained_variance"] = float(
                 explained_variance(batch.old_values, batch.returns, batch.mask)
             )
@@ -194,7 +226,7 @@ class Agent:
             metrics["rollout/environment_restarts"] = float(rollout.restarts)
         metrics["time/env_seconds"] = rollout.env_seconds
         metrics["time/act_seconds"] = collected - begin - rollout.env_seconds
-        metrics["time/update_seconds"] = finish - collected
+        metrics["time/update_seconds"] = self._update_seconds = finish - collected
         metrics["time/fps"] = rollout.steps / (finish - begin)
         return metrics, rollout.episodes
 
@@ -284,7 +316,7 @@ class Agent:
 
     def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
         """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
-        tensors = {"policy": dict(self.policy.state_dict()), "optimiser": optimiser_tensors(self.optimiser)}
+        tensors = self._learned()
         normalisers = self.normalisers.state()
         if normalisers:
             tensors["normalisers"] = normalisers
@@ -326,8 +358,7 @@ class Agent:
         """Put back what `snapshot` gave, into an agent of the same settings."""
         for name, parameter in self.policy.named_parameters():
             require_restorable(name, tensors["policy"][name], parameter)
-        self.policy.load_state_dict(tensors["policy"])
-        restore_optimiser(self.optimiser, tensors["optimiser"])
+        self._unlearn(tensors)
         normalisers = dict(tensors.get("normalisers", {}))
         running = normalisers.get("rewards.running")
         if running is not None and len(running) != self.environments.num_envs:

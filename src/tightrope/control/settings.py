@@ -121,9 +121,12 @@ class TrainSettings(Settings):
     )
     checkpoint_every: float | None = setting(
         0.05,
-        "Fraction of the run between checkpoints, where most environments are reset; none: only the last.",
+        "Fraction of the run between checkpoints, where most environments are reset; none: by the clock.",
         above=0,
         at_most=1,
+    )
+    checkpoint_minutes: float | None = setting(
+        10.0, "A checkpoint also this many minutes after the last one; none: off.", above=0
     )
     keep_checkpoints: int | None = setting(
         3, "Checkpoints that are kept, the newest ones; the best policy always is. none: all.", at_least=2

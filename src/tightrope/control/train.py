@@ -129,6 +129,7 @@ class AgentLearner:
         self.run = run
         self.listeners = listeners
         self.seconds = 0.0
+        self.pending: Update | None = None
         self.best = -math.inf
         self.final: dict[str, float] = {}
         self.merit = None  # the newest checkpoints are kept; the best policy has its own folder
@@ -241,7 +242,9 @@ class AgentLearner:
         """The agent, the best evaluation, and the episodes that are running where they can be continued."""
         tensors, state = self.agent.snapshot()
         state |= {"best": self.best, "wall_seconds": self.seconds}
-        state["episodes"] = self.agent.collector.state() if self.agent.steps else None
+        # after a rollout that was dropped new episodes begin
+        running = self.agent.steps and not self.agent.fresh
+        state["episodes"] = self.agent.collector.state() if running else None
         return tensors, state
 
     def restore(self, point: Checkpoint) -> None:

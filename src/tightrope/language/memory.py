@@ -182,8 +182,11 @@ def _roles(shapes: Shapes, job: Job, adapted: int) -> Iterator[Entry]:
         yield Entry("reference: a frozen copy", whole)
     learnt = whole if job.language_head else shapes.item * shapes.base
     yield from _trained(job.trained, learnt if job.tune == "full" else adapter)
+    own = {"adapter": adapter, "separate": shapes.item * shapes.base}.get(job.critic, 0)
+    if job.response_tokens and job.tune == "lora" and job.critic != "separate":
+        kept = adapter + (own + head if job.critic != "none" else 0)
+        yield Entry("a copy of what is trained, to undo an update", 3 * kept, "update")
     if job.critic != "none":
-        own = {"head": 0, "adapter": adapter, "separate": shapes.item * shapes.base}[job.critic]
         role = "critic" if job.language_head else "score head"
         yield Entry(f"{role}: weights", head + (whole if job.critic == "separate" else own))
         yield from _trained(role, own + head)

@@ -41,7 +41,10 @@ class ModelSettings(Settings):
         False, "Compute activations again in the backward pass: less memory, a third more time."
     )
     checkpoint_every: float | None = setting(
-        0.25, "Fraction of the run between checkpoints; none: only the last.", above=0, at_most=1
+        0.25, "Fraction of the run between checkpoints; none: by the clock.", above=0, at_most=1
+    )
+    checkpoint_minutes: float | None = setting(
+        10.0, "A checkpoint also this many minutes after the last one; none: off.", above=0
     )
     keep_checkpoints: int | None = setting(
         3,

@@ -183,17 +183,17 @@ class Run:
         warn: Callable[[str], None],
         merit: float | None = None,
         final: bool = False,
-    ) -> None:
-        """Save a checkpoint at ``step`` and verify it. Then all but the newest ``keep`` are deleted, except
-        the one with the highest ``merit``.
+    ) -> bool:
+        """Save a checkpoint at ``step`` and verify it; returns whether it was written. Then all but the
+        newest ``keep`` are deleted, except the one with the highest ``merit``.
 
         The record files are on the disk before the checkpoint is visible; it stores their lengths. If the
         disk refuses to write, a warning is sent and training continues; for the ``final`` checkpoint
         CannotWrite is raised. ``settings``, ``records`` and ``merit`` are added to ``state``. A signal takes
         effect at the end.
         """
-        with signals.uninterrupted():
-            self._save(step, tensors, state, keep=keep, warn=warn, merit=merit, final=final)
+        with signals.uninterrupted("the save under way"):
+            return self._save(step, tensors, state, keep=keep, warn=warn, merit=merit, final=final)
 
     def _save(
         self,
@@ -205,7 +205,7 @@ class Run:
         warn: Callable[[str], None],
         merit: float | None,
         final: bool,
-    ) -> None:
+    ) -> bool:
         self.lock()
         self.require_there()
         folder, clock = self.checkpoint_folder(step), time.perf_counter()
@@ -219,7 +219,7 @@ class Run:
             if final:
                 raise
             warn(f"No checkpoint at step {step:,}: {error.what} {error.advice}. Training continues.")
-            return
+            return False
         try:
             retention.prune(self.checkpoints, keep)
         except OSError as error:
@@ -227,6 +227,7 @@ class Run:
         size = sum(path.stat().st_size for path in folder.iterdir())
         seconds = time.perf_counter() - clock
         self._costs = {"time/checkpoint_seconds": seconds, "time/checkpoint_megabytes": size / 1e6}
+        return True
 
     def require_there(self) -> None:
         """CannotWrite when the folder was deleted or renamed: a save would make a part of it again."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from tightrope.runs.records import figures
 from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.training.parameters import Tensors
@@ -37,14 +38,29 @@ class Update:
     pause: float = 0.0
 
 
+def update_of(saved: dict[str, Any]) -> Update:
+    """The update that a checkpoint holds as JSON."""
+    return Update(
+        int(saved["step"]),
+        int(saved["total_steps"]),
+        figures(saved["metrics"]),
+        int(saved["before"]),
+        bool(saved["on_grid"]),
+        [(float(r), int(n), bool(t)) for r, n, t in saved["episodes"]],
+        [dict(row) for row in saved["samples"]],
+    )
+
+
 class Learner(Protocol):
     """State and updates of a run; `loop.train` does everything else.
 
-    ``seconds`` of training and ``changes`` of settings are kept by the loop.
+    ``seconds`` of training, ``changes`` of settings and the update ``pending``, which is done and not yet
+    recorded, are kept by the loop.
     """
 
     seconds: float
     changes: dict[str, Any]
+    pending: Update | None
 
     @property
     def settings(self) -> Any:
@@ -74,7 +90,10 @@ class Learner(Protocol):
         """Prepare for the first update; returns lines that describe the run."""
 
     def iterate(self) -> Iterator[Update]:
-        """The updates from the present position on."""
+        """The updates from the present position on. The loop lets no signal interrupt them; what can be left
+        at any moment is `signals.interruptible`. When a KeyboardInterrupt comes out, the learner is as it was
+        after its newest update.
+        """
 
     def evaluate(self, update: Update | None) -> dict[str, float]:
         """The figures that are due after this update (None: before the first); empty when none are."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import shlex
 import time
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from tightrope.runs.durable import CannotWrite
 from tightrope.runs.run import Run
 from tightrope.training.events import Change, Evaluated, Finished, Listeners, Samples, Started, Updated
 from tightrope.training.learner import Learner, Update, change
-from tightrope.training.resume import restore_changes
+from tightrope.training.resume import restore_rows
 from tightrope.training.tensorboard import TensorBoard
 
 
@@ -39,28 +40,42 @@ class _Loop:
         self.learner = learner
         self.run = run
         self.listeners = listeners
+        self.saved, self.saved_at = learner.position, time.monotonic()  # the position that a resume begins at
+        self.told_of_handlers = False
 
     def train(self) -> dict[str, Any]:
-        learner, run = self.learner, self.run
-        if learner.settings.tensorboard:
+        if self.learner.settings.tensorboard:
             self.listeners.add(TensorBoard())
-        with signals.stoppable(), _naming_the_command(run):
-            self._start()
-            stop, updated = self._requests(), False
-            for update in () if stop else self._updates():
-                updated = True
-                signals.raise_if_stopped()
-                self._record(update)
-                # before the save, so that a resumed run knows the changes made before its checkpoint
-                if self._requests():
-                    break
-                if update.on_grid and not learner.complete:  # the end has its own save
-                    self._save()
-            self._conclude(row=updated)
-            self._save(final=True)
-            summary = learner.finish(run)
-            run.finish(summary)
+        with signals.stoppable(), _naming_the_command(self.run):
+            self._keep_handlers()
+            try:
+                summary = self._train()
+            except KeyboardInterrupt as stop:
+                self._save_and_leave(stop)
+                raise
         self.listeners(Finished(summary))
+        return summary
+
+    def _train(self) -> dict[str, Any]:
+        learner, run = self.learner, self.run
+        self._start()
+        updates, stop = self._updates(), self._requests()
+        while not stop:
+            with signals.uninterrupted():
+                learner.pending = next(updates, None)
+            if learner.pending is None:
+                break
+            update = learner.pending
+            self._keep_handlers()
+            self._record(update)
+            # before the save, so that a resumed run knows the changes made before its checkpoint
+            stop = self._requests()
+            if not (stop or learner.complete) and (update.on_grid or self._clock_says_so()):
+                self._save()  # the end has its own
+        self._conclude()
+        self._save(final=True)
+        summary = learner.finish(run)
+        run.finish(summary)
         return summary
 
     def _start(self) -> None:
@@ -72,9 +87,13 @@ class _Loop:
             self._evaluated(0, first)
 
     def _updates(self) -> Iterator[Update]:
-        """The learner's updates, timed; after a NaN or an infinity, those from the newest checkpoint on."""
+        """The learner's updates, timed; after a NaN or an infinity, those from the newest checkpoint on.
+        First the one that was not yet recorded there.
+        """
         learner = self.learner
         while True:
+            if learner.pending is not None:
+                yield learner.pending
             try:
                 clock = time.perf_counter()
                 for update in learner.iterate():
@@ -98,7 +117,8 @@ class _Loop:
         except ValueError as missing:
             raise type(error)(f"{error} There is no checkpoint to go back to: {missing}") from error
         learner.seconds = seconds
-        restore_changes(learner, run)
+        restore_rows(learner, run, point)
+        self.saved = learner.position
         reason = str(error).splitlines()[0]
         self.listeners.warn(
             f"{reason} Going back to the checkpoint of step {learner.position}, "
@@ -107,30 +127,34 @@ class _Loop:
         )
 
     def _record(self, update: Update) -> None:
-        """Evaluate if it is due, write the rows, send the events."""
+        """Evaluate if it is due, write the rows, send the events. A run that is stopped in the evaluation
+        saves the update as pending, and its resume records it.
+        """
         learner, run, step = self.learner, self.run, update.step
         metrics = update.metrics
         if learner.rollbacks:
             metrics["train/rollbacks"] = float(learner.rollbacks)
         metrics["time/seconds"] = learner.seconds
         found = learner.evaluate(update)
-        metrics |= found
         self._evaluated(step, found)
-        run.record_episodes(
-            {"step": step, "return": r, "length": n, "terminated": t} for r, n, t in update.episodes
-        )
-        recorded = run.record(step, learner.seconds, metrics)
-        run.record_samples(update.samples)
+        with signals.uninterrupted():
+            run.record_episodes(
+                {"step": step, "return": r, "length": n, "terminated": t} for r, n, t in update.episodes
+            )
+            recorded = run.record(step, learner.seconds, metrics | found)
+            run.record_samples(update.samples)
+            learner.pending = None
         self.listeners(Updated(step, learner.total, learner.seconds, recorded))
         if update.on_grid and update.samples:
             self.listeners(Samples(step, update.samples))
 
-    def _conclude(self, *, row: bool) -> None:
-        """The final figures; ``row``: they are also a row of the metrics, which a run that was complete when
-        it was resumed has already.
+    def _conclude(self) -> None:
+        """The final figures. They are also a row of the metrics, after those of updates, which have a time; a
+        run that was finished when it was resumed has it already.
         """
         learner, found = self.learner, self.learner.conclude()
-        if found and row:
+        rows = self.run.read_metrics() if found else []
+        if rows and "time/seconds" in rows[-1]:
             self.run.record(learner.position, learner.seconds, found)
         self._evaluated(learner.position, found)
 
@@ -153,15 +177,48 @@ class _Loop:
                 self.listeners.info(f"stopped by a listener at step {self.learner.position:,}{reason}")
         return stop
 
+    def _clock_says_so(self) -> bool:
+        minutes = self.learner.settings.checkpoint_minutes
+        return minutes is not None and time.monotonic() - self.saved_at >= 60 * minutes
+
     def _save(self, *, final: bool = False) -> None:
+        """A checkpoint of the present state; CannotWrite where ``final`` and the disk refuses it."""
         learner = self.learner
-        tensors, state = learner.snapshot()
-        self.run.save(
-            learner.position,
-            tensors,
-            state,
-            keep=learner.settings.keep_checkpoints,
-            warn=self.listeners.warn,
-            merit=learner.merit,
-            final=final,
-        )
+        with signals.uninterrupted():
+            tensors, state = learner.snapshot()
+            if learner.pending is not None:
+                state["pending"] = dataclasses.asdict(learner.pending)
+            saved = self.run.save(
+                learner.position,
+                tensors,
+                state,
+                keep=learner.settings.keep_checkpoints,
+                warn=self.listeners.warn,
+                merit=learner.merit,
+                final=final,
+            )
+            self.saved, self.saved_at = learner.position if saved else self.saved, time.monotonic()
+
+    def _save_and_leave(self, stop: KeyboardInterrupt) -> None:
+        """After a signal the learner is as it was after its newest update: save that, unless a checkpoint
+        holds it. A second signal leaves at once.
+        """
+        step = self.learner.position
+        if not signals.answer() or step == self.saved:
+            return
+        try:
+            self._save(final=True)
+        except CannotWrite as error:
+            self.listeners.warn(f"Step {step:,} is not saved: {error.what} {error.advice}.")
+        else:
+            stop.add_note(f"Saved at step {step:,} in {self.run.path}, which can be resumed.")
+
+    def _keep_handlers(self) -> None:
+        """Code of the user's may replace the handlers of signals; then no signal would save any more."""
+        replaced = signals.take_back()
+        if replaced and not self.told_of_handlers:
+            self.told_of_handlers = True
+            self.listeners.warn(
+                f"An environment, a reward function or a library has replaced the handler of "
+                f"{' and '.join(replaced)}. It was put back, so that a signal still saves the run."
+            )

@@ -1,16 +1,19 @@
-"""Save and restore every tensor that training changes."""
+"""Save and restore every tensor that training changes, also around one update."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from tightrope.algorithms.nonfinite import require_restorable
 from tightrope.algorithms.optimise import optimiser_tensors, restore_optimiser
+from tightrope.runs import signals
 
 Tensors = dict[str, dict[str, Tensor]]
+COPY_FROM = 0.5  # seconds of an update from which a copy of what it changes costs nothing beside it
 
 
 def tensors_of(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> Tensors:
@@ -30,3 +33,24 @@ def restore_tensors(
     for index, parameter in enumerate(parameters):
         parameter.copy_(saved[index])
     restore_optimiser(optimiser, tensors["optimiser"])
+
+
+@contextlib.contextmanager
+def whole_update(
+    seconds: float | None, tensors: Callable[[], Tensors], put_back: Callable[[Tensors], None] | None
+) -> Iterator[None]:
+    """Around the steps of an update, which changes ``tensors()`` in place. After a signal it is finished if
+    it takes less than PATIENCE, by the ``seconds`` that the one before took (None: not known). Otherwise it
+    is undone by ``put_back`` and a copy; with ``put_back`` None no copy is kept, and it is finished all the
+    same.
+    """
+    copy: Tensors | None = None
+    if put_back is not None and (seconds is None or seconds > COPY_FROM):
+        copy = {name: {key: x.clone() for key, x in group.items()} for name, group in tensors().items()}
+    try:
+        with signals.uninterrupted("the update under way", seconds, can_undo=copy is not None):
+            yield
+    except KeyboardInterrupt:
+        if copy is not None and put_back is not None:
+            put_back(copy)
+        raise

@@ -6,7 +6,7 @@ from tightrope.runs.checkpoint import understood
 from tightrope.runs.retention import Checkpoint, steps_in
 from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
-from tightrope.training.learner import Learner, change
+from tightrope.training.learner import Learner, change, update_of
 
 
 def newest_point(run: Run, listeners: Listeners) -> Checkpoint | None:
@@ -24,12 +24,17 @@ def continue_from(learner: Learner, run: Run, point: Checkpoint | None) -> None:
     """
     run.rewind(point)
     run.update_settings(learner.settings.to_json())
-    restore_changes(learner, run)
+    restore_rows(learner, run, point)
 
 
-def restore_changes(learner: Learner, run: Run) -> None:
-    """Apply exactly the changes of settings that the run has recorded."""
+def restore_rows(learner: Learner, run: Run, point: Checkpoint | None) -> None:
+    """Apply exactly the changes of settings that the run has recorded; and the update of ``point`` that it
+    had not recorded yet is pending again.
+    """
     learner.changes.clear()
     with understood(run.path):
         for row in run.read_changes():
             change(learner, row["setting"], row["value"])
+    pending = None if point is None else point.state.get("pending")
+    with understood(run.path if point is None else point.folder):
+        learner.pending = None if pending is None else update_of(pending)

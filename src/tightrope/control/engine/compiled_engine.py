@@ -298,6 +298,10 @@ class _Run:
                     status = self._call(role, int(self.ledgers[0, kernels.AT]), self.epoch, self.epoch + 1)
                 if status != kernels.RUNNING:
                     break
+        except BaseException:
+            self.control[threads.LEFT] = 1
+            self.engine._helper.wait()  # who undoes the update writes to the same weights
+            raise
         finally:
             self.control[threads.LEFT] = 1
         return status

@@ -43,6 +43,8 @@ from tightrope.control.environments.processes import (
     READY,
     RESET,
     SET_STATE,
+    SETTLE,
+    SETTLED,
     SPIN,
     STEP,
     SharedArray,
@@ -85,6 +87,7 @@ class EnvironmentPool(Environments):
         self._seed = 0
         self._count = 0  # steps since the last reset of all
         self._restarts_seen = 0  # of those in the buffers, how many the counter holds
+        self._under_way = False  # a reset or a step, until every worker has answered
         self._bounds = [round(k * len(makers) / num_groups) for k in range(num_groups + 1)]
         if policy.restart and num_groups > 1:  # no environment in this process: its death would end the run
             self._bounds.insert(0, 0)
@@ -154,16 +157,22 @@ class EnvironmentPool(Environments):
         self._count = 0
         self._restarts_seen = 0
         self._buffers.restarts.fill(0)
+        if self._under_way:  # a signal ended it
+            for worker in self._workers:
+                worker.settle()
+        self._under_way = True
         for worker in self._workers:
             worker.send(RESET, seed)
         if self._group is not None:
             self._group.reset(seed)
         self._has_masks = self._await_workers() or (self._group is not None and self._group.has_masks)
+        self._under_way = False
         step = self._buffers.step(self._has_masks)
         return step.inputs, step.action_mask
 
     def send(self, rows: slice, actions: np.ndarray) -> None:
         """See Environments."""
+        self._under_way = True
         self._buffers.actions[rows] = self.action_layout.squashed(actions) if self.squash else actions
         if rows.stop > self._bounds[1]:
             for worker in self._workers:
@@ -175,6 +184,7 @@ class EnvironmentPool(Environments):
         if self._group is not None:
             self._group.step()
         self._await_workers()
+        self._under_way = False
         return self._buffers.step(self._has_masks)
 
     # ------------------------------------------------------------------------------------------------- state
@@ -404,6 +414,8 @@ def _obey(channel: socket.socket, group: EnvGroup, spin: float) -> bytes | None:
         group.set_state(json.loads(receive_all(channel, number)))
     elif command == GET_STATE:
         return pack_json(group.get_state())
+    elif command == SETTLE:
+        return SETTLED
     return None if command == CLOSE else b""
 
 

@@ -27,9 +27,10 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy
 
 COMMAND = struct.Struct("<cq")  # one of the following, and a number: a seed, or how many bytes of data follow
-RESET, STEP, GET_STATE, SET_STATE, CLOSE = b"r", b"s", b"g", b"p", b"c"
+RESET, STEP, GET_STATE, SET_STATE, SETTLE, CLOSE = b"r", b"s", b"g", b"p", b"t", b"c"
 LENGTH = struct.Struct("<Q")
 READY, MASKED, BROKEN = b"k", b"m", b"e"  # replies: done; done, and there are action masks; a fault follows
+SETTLED = b"t"  # follows the reply to SETTLE, and no other
 TO_BUILD = 60.0  # seconds at least to make the environments, which may import much
 SPIN = 2e-4  # seconds to poll for a message before sleeping; waking up costs about as much as a step
 
@@ -141,6 +142,13 @@ class WorkerProcess:
             self._built = True
             self._set_patience(self._timeout)
         return reply == MASKED
+
+    def settle(self) -> None:
+        """Take the replies that a signal kept from being read. EnvironmentFault as `wait`."""
+        self.send(SETTLE)
+        self.wait()
+        while receive_soon(self._socket, 1, self._spin) not in (SETTLED, b""):
+            pass
 
     def states(self) -> Any:
         """The packed states that follow the reply to GET_STATE. EnvironmentFault as `wait`."""

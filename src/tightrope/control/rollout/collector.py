@@ -88,6 +88,10 @@ class Collector:
         self.environments.count_from(restarts)
         self._restarts = restarts
 
+    def drop(self) -> None:
+        """Forget the rollout under way: its restarts will be counted when it is collected again."""
+        self.environments.count_from(self._restarts)
+
     def noise(self, num_steps: int, rows: int, rng: np.random.Generator) -> Array:
         """[T, rows, A] float32: uniforms for categories and bits, standard normals for Gaussian columns."""
         shape = (num_steps, rows, len(self._uniform))

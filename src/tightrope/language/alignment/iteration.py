@@ -7,7 +7,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -49,19 +49,48 @@ from tightrope.language.reward.judge import (
 )
 from tightrope.language.settings import AlignSettings, RLHFSettings
 from tightrope.maths.values import explained_variance
+from tightrope.runs import signals
 from tightrope.runs.checkpoint import counted, understood
 from tightrope.runs.records import figures
 from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Update, crosses
-from tightrope.training.parameters import Tensors, restore_tensors, tensors_of
+from tightrope.training.parameters import Tensors, restore_tensors, tensors_of, whole_update
 
 # what a checkpoint holds of a trainer as it is, and how it is read back
 SAVED: dict[str, Callable[[Any], Any]] = {
     "episodes": counted, "iteration": counted, "kl_beta": float, "stopped": bool, "seconds": float,
     "newest": figures,
 }  # fmt: skip
+
+
+class Taken(NamedTuple):
+    """What an iteration learns from: the prompts, one for each response; responses, scores, which of them
+    count, and the batch made of them. ``scale``: of whiten_rewards. ``pause``: seconds of gold scores.
+    """
+
+    asked: list[Prompt]
+    experience: Experience
+    scores: Scores
+    valid: Tensor
+    batch: Batch
+    scale: Any
+    metrics: dict[str, float]
+    pause: float
+    seconds: float
+    score_seconds: float
+
+    @property
+    def counts(self) -> bool:
+        """Whether there is a response to learn from."""
+        return bool(self.scores.valid.any())
+
+    def rows(self, tokenizer: Any, episodes: int) -> list[dict[str, Any]]:
+        """The responses as samples.jsonl holds them."""
+        return sample_rows(
+            tokenizer, self.asked, self.experience, self.scores, self.batch, self.valid, episodes
+        )
 
 
 class Trainer:
@@ -105,6 +134,8 @@ class Trainer:
         self.seconds, self.rollbacks, self.newest = 0.0, 0, dict[str, float]()
         self.changes: dict[str, Any] = {}
         self.micro_batch_size = settings.update.micro_batch_size  # halved when memory runs out
+        self.pending: Update | None = None
+        self._update_seconds: float | None = None  # of the newest update
         self._warned = set[tuple[str, str]]()
 
     def _read_prompts(self, source: Any) -> list[Prompt]:
@@ -205,18 +236,41 @@ class Trainer:
 
     def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
         """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
+        state = {**self._numbers(), "story": "align", "prompts_sha256": self._hash_of_prompts()}
+        return self._learned(), state
+
+    def _learned(self) -> Tensors:
+        """What an update changes in place."""
+        return tensors_of(self.roles.parameters(), self.optimiser)
+
+    def _unlearn(self, tensors: Tensors) -> None:
+        """Put back what `_learned` gave."""
+        restore_tensors(tensors, self.roles.parameters(), self.optimiser)
+
+    def _numbers(self) -> dict[str, Any]:
+        """What an iteration changes beside tensors, as JSON."""
         state: dict[str, Any] = {name: getattr(self, name) for name in SAVED} | {
-            "story": "align",
             "rollbacks": self.rollbacks,
             "micro_batch_size": self.micro_batch_size,
             "prompt_position": self.order.position,
-            "prompts_sha256": self._hash_of_prompts(),
             "rng": {"update": self.update_rng.bit_generator.state},
             "monitor": self.monitor.state(),
         }
         if self.pretraining is not None:
             state["rng"]["ptx"] = self.pretraining.rng.bit_generator.state
-        return tensors_of(self.roles.parameters(), self.optimiser), state
+        return state
+
+    def _put_back(self, state: dict[str, Any]) -> None:
+        """Put back what `_numbers` gave."""
+        for name, read in SAVED.items():
+            setattr(self, name, read(state[name]))
+        self.rollbacks = counted(state.get("rollbacks", 0))
+        self.micro_batch_size = state.get("micro_batch_size", self.micro_batch_size)
+        self.order.position = counted(state["prompt_position"])
+        self.update_rng.bit_generator.state = state["rng"]["update"]
+        self.monitor.restore(state["monitor"])
+        if self.pretraining is not None:
+            self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 
     def restore(self, point: Checkpoint) -> None:
         """Put back a checkpoint of a run with the same settings. ValueError for one of another command or
@@ -231,16 +285,8 @@ class Trainer:
                 "the run started with, or start a new run."
             )
         with understood(folder):
-            restore_tensors(tensors, self.roles.parameters(), self.optimiser)
-            for name, read in SAVED.items():
-                setattr(self, name, read(state[name]))
-            self.rollbacks = counted(state.get("rollbacks", 0))
-            self.micro_batch_size = state.get("micro_batch_size", self.micro_batch_size)
-            self.order.position = counted(state["prompt_position"])
-            self.update_rng.bit_generator.state = state["rng"]["update"]
-            self.monitor.restore(state["monitor"])
-            if self.pretraining is not None:
-                self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
+            self._unlearn(tensors)
+            self._put_back(state)
 
     def roll_back(self, point: Checkpoint) -> None:
         """Go back to a checkpoint of this run; random numbers from there on depend on the seed, the episode
@@ -262,20 +308,54 @@ class Trainer:
     # ---------------------------------------------------------------------------------------- an iteration
 
     def iterate(self) -> Iterator[Update]:
-        """One iteration at a time."""
+        """One iteration at a time. One that a signal ends is as if it had not begun."""
         while count := self._next_prompts():
-            yield self._one_iteration([self.prompts[i] for i in self.order.take(count)])
+            before = self._numbers()
+            try:
+                update = self._one_iteration([self.prompts[i] for i in self.order.take(count)])
+            except KeyboardInterrupt:
+                self._put_back(before)
+                raise
+            yield update
 
     def _one_iteration(self, prompts: Sequence[Prompt]) -> Update:
         """sample -> score -> advantages -> update."""
-        settings, gold, before = self.settings, dict[str, float](), self.episodes
+        settings, before = self.settings, self.episodes
+        present = settings.update.unchecked(**self.changes).at(self.episodes / settings.total_episodes)
+        set_learning_rates(self.optimiser, present)
+        with signals.interruptible():
+            taken = self._take_experience(prompts)
+        experience, metrics = taken.experience, taken.metrics
+        begin = time.perf_counter()
+        if taken.counts and not self.stopped:
+            # a KL in the loss is scaled as the rewards were
+            metrics |= self._update(taken.batch, present, experience, self.kl_beta * taken.scale)
+            if settings.critic != "none":
+                metrics["train/explained_variance"] = float(
+                    explained_variance(taken.batch.old_values, taken.batch.returns, taken.batch.mask)
+                )
+        metrics["objective/kl_beta"] = self.kl_beta
+        metrics["train/learning_rate"] = present.learning_rate
+        metrics["time/score_seconds"] = taken.score_seconds
+        metrics["time/update_seconds"] = self._update_seconds = time.perf_counter() - begin
+        if settings.kl_goal is not None and taken.counts:
+            goal = {"target": settings.kl_goal, "horizon": settings.kl_horizon}
+            self.kl_beta = adapted(self.kl_beta, metrics["objective/kl"], len(taken.asked), **goal)
+        self.episodes += len(taken.asked)
+        self.iteration += 1
+        seconds = metrics["time/update_seconds"] + taken.seconds
+        metrics["time/fps"] = float(experience.responses.mask.sum()) / seconds
+        rows = taken.rows(self.roles.tokenizer, self.episodes)
+        on_grid = self._reached(settings.checkpoint_every)
+        return Update(self.episodes, self.total, metrics, before, on_grid, samples=rows, pause=taken.pause)
+
+    def _take_experience(self, prompts: Sequence[Prompt]) -> Taken:
+        """Responses, their scores and advantages, and the metrics of these. No weight is changed."""
+        settings, gold = self.settings, dict[str, float]()
         pause = time.perf_counter()
         if self.gold is not None and (not self.episodes or self._reached(settings.evaluate_every)):
             gold = self.gold_scores()  # of the policy that samples next, whose KL is in the same row
         begin = time.perf_counter()
-        pause = begin - pause
-        present = settings.update.unchecked(**self.changes).at(self.episodes / settings.total_episodes)
-        set_learning_rates(self.optimiser, present)
         stream = settings.seed + 2**40 * self.rollbacks  # not the numbers that led to a NaN
         keep = (
             settings.one_pass and self.micro_batch_size is None and self.iteration >= settings.critic_warmup
@@ -300,29 +380,8 @@ class Trainer:
         gap = metrics["objective/sampling_gap"]
         refuse_mismatch(gap, self.log_ratio_limit, settings.dtype, first=not self.iteration)
         self._watch(metrics)
-        prepared = time.perf_counter()
-        counts = bool(scores.valid.any())
-        if counts and not self.stopped:
-            # a KL in the loss is scaled as the rewards were
-            metrics |= self._update(batch, present, experience, self.kl_beta * found.scale)
-            if settings.critic != "none":
-                metrics["train/explained_variance"] = float(
-                    explained_variance(batch.old_values, batch.returns, batch.mask)
-                )
-        metrics["objective/kl_beta"] = self.kl_beta
-        metrics["train/learning_rate"] = present.learning_rate
-        metrics["time/score_seconds"] = scored - gathered
-        metrics["time/update_seconds"] = time.perf_counter() - prepared
-        if settings.kl_goal is not None and counts:
-            goal = {"target": settings.kl_goal, "horizon": settings.kl_horizon}
-            self.kl_beta = adapted(self.kl_beta, metrics["objective/kl"], len(asked), **goal)
-        self.episodes += len(asked)
-        self.iteration += 1
-        seconds = metrics["time/update_seconds"] + scored - begin
-        metrics["time/fps"] = float(experience.responses.mask.sum()) / seconds
-        rows = sample_rows(self.roles.tokenizer, asked, experience, scores, batch, valid, self.episodes)
-        on_grid = self._reached(settings.checkpoint_every)
-        return Update(self.episodes, self.total, metrics, before, on_grid=on_grid, samples=rows, pause=pause)
+        times = {"pause": begin - pause, "seconds": scored - begin, "score_seconds": scored - gathered}
+        return Taken(asked, experience, scores, valid, batch, found.scale, metrics, **times)
 
     def _update(
         self, batch: Batch, present: RLHFSettings, experience: Experience, kl_weight: float
@@ -340,16 +399,18 @@ class Trainer:
             batch = dataclasses.replace(batch, advantages=advantages)
             kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
         extra = None if warming else self._extra_loss(kl_weight)
-        metrics = ppo.update(
-            model,
-            self.optimiser,
-            batch,
-            present.unchecked(micro_batch_size=self.micro_batch_size),
-            self.update_rng,
-            extra_loss=extra,
-            draw=None if extra is None or self.pretraining is None else self.pretraining.draw,
-            log_ratio_limit=self.log_ratio_limit,
-        )
+        adapters = self.settings.tune == "lora" and self.settings.critic != "separate"
+        with whole_update(self._update_seconds, self._learned, self._unlearn if adapters else None):
+            metrics = ppo.update(
+                model,
+                self.optimiser,
+                batch,
+                present.unchecked(micro_batch_size=self.micro_batch_size),
+                self.update_rng,
+                extra_loss=extra,
+                draw=None if extra is None or self.pretraining is None else self.pretraining.draw,
+                log_ratio_limit=self.log_ratio_limit,
+            )
         if "train/micro_batch_size" in metrics:
             self._smaller(int(metrics["train/micro_batch_size"]))
         return metrics

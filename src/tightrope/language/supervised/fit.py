@@ -23,6 +23,7 @@ from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam
 from tightrope.language.data.examples import Item
 from tightrope.language.settings import SupervisedSettings
+from tightrope.runs import signals
 from tightrope.runs.checkpoint import counted, understood
 from tightrope.runs.records import figures
 from tightrope.runs.retention import Checkpoint
@@ -80,6 +81,7 @@ class SupervisedLearner:
         self.newest: dict[str, float] = {}
         self.micro_batch_size = settings.micro_batch_size
         self.changes: dict[str, Any] = {}
+        self.pending: Update | None = None
 
     @property
     def position(self) -> int:
@@ -237,7 +239,8 @@ def take_step(
                 sums[name] = sums[name] + x if name in sums else x
         return sums
 
-    sums = parts.compute(len(minibatch), gradient, optimiser)
+    with signals.interruptible():  # a gradient changes nothing yet
+        sums = parts.compute(len(minibatch), gradient, optimiser)
     norm = checked.take(optimiser, settings.max_grad_norm, sums["loss"])
     checked.halted(lambda: explain_loss(optimiser, sums["loss"], "in this step"), poll=True)
     metrics = {f"{objective.name}/{name}": float(x) / count for name, x in sums.items()}

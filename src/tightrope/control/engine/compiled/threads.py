@@ -81,6 +81,13 @@ class Helper:
         self._jobs.put((job, control))
         return True
 
+    def wait(self) -> None:
+        """Wait until it has nothing to do."""
+        if self._thread is not None and self._thread.is_alive():
+            idle = threading.Event()
+            self._jobs.put((idle.set, np.zeros(CONTROL_SIZE, np.int64)))
+            idle.wait(timeout=10)
+
     def stop(self) -> None:
         """End the thread."""
         if self._end is not None:
