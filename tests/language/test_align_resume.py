@@ -136,7 +136,7 @@ def test_a_run_that_its_budget_stopped_stays_stopped(tmp_path, monkeypatch, valu
 
 
 def test_the_command_names_the_judge_again(tmp_path, monkeypatch, values, capsys):
-    """Stopped by SIGTERM: 143, the newest checkpoint, the repeated steps, and a working command."""
+    """Stopped by SIGTERM: 143, what was saved, and a working command."""
     judge, prompts, run = tmp_path / "judge.py", tmp_path / "prompts.txt", tmp_path / "run"
     judge.write_text("def score(completions, **_):\n    return [float(len(c)) for c in completions]\n")
     prompts.write_text("\n".join(PROMPTS))
@@ -154,8 +154,8 @@ def test_the_command_names_the_judge_again(tmp_path, monkeypatch, values, capsys
         patch.setattr(Trainer, "_one_iteration", stop)
         assert main(["align", *words]) == 143
     said = capsys.readouterr().err
-    assert "Stopped by SIGTERM at response 24. The newest valid checkpoint is " in said
-    assert "step-000000000016; 8 responses since then will be repeated." in said
+    assert "Stopped by SIGTERM at response 24. It is saved in " in said
+    assert "step-000000000024; what was under way is repeated." in said
     assert f"\n  tightrope resume {run} --reward {judge}:score\n" in said
     assert main(["resume", str(run), "--reward", f"{judge}:score", "--quiet"]) == 0
 

@@ -50,6 +50,45 @@ def test_a_second_signal_does_not_wait():
     assert caught.value.code == 130
 
 
+def test_what_can_be_left_at_any_moment_is_left_at_once():
+    steps = []
+    with pytest.raises(signals.Stopped), signals.stoppable(), signals.uninterrupted():
+        with signals.interruptible():
+            os.kill(os.getpid(), signal.SIGTERM)
+            pytest.fail("it went on")
+        steps.append("after")
+    assert not steps
+    with pytest.raises(signals.Stopped), signals.stoppable(), signals.uninterrupted():
+        os.kill(os.getpid(), signal.SIGTERM)
+        with signals.interruptible():
+            pytest.fail("it began")
+
+
+@pytest.mark.parametrize("before", [False, True], ids=["inside", "just before"])
+@pytest.mark.parametrize(
+    ("seconds", "can_undo", "waits", "told"),
+    [
+        (3.0, True, True, "about 3 s more"), (3.0, False, True, "about 3 s more"), (0.5, True, True, ""),
+        (1000.0, True, False, ""), (1000.0, False, True, "about 1,000 s more"),
+        (None, True, False, ""), (None, False, True, "finished first. A second"),
+    ],
+)  # fmt: skip
+def test_work_is_waited_for_unless_it_is_long_and_can_be_undone(
+    capsys, seconds, can_undo, waits, told, before
+):
+    steps = []
+    with pytest.raises(signals.Stopped), signals.stoppable(), signals.uninterrupted():
+        if before:
+            os.kill(os.getpid(), signal.SIGINT)
+        with signals.uninterrupted("the update under way", seconds, can_undo=can_undo):
+            if not before:
+                os.kill(os.getpid(), signal.SIGINT)
+            steps.append("done")
+    assert bool(steps) == waits
+    said = capsys.readouterr().err
+    assert told in said and bool(said) == bool(told)
+
+
 def test_what_swallows_a_signal_is_stopped_at_the_next_update():
     with pytest.raises(signals.Stopped), signals.stoppable():
         with contextlib.suppress(BaseException):  # as a reward function may
@@ -67,22 +106,28 @@ def test_before_a_run_and_without_a_checkpoint(tmp_path):
 
 # ---------------------------------------------------------------------------- real processes
 
-SLOW_SAVE = """
-import os, sys, time
-from tightrope.runs import durable
-real = durable.put
-def slow(temporary, folder):
-    print("SAVING", flush=True)
-    time.sleep(float(os.environ.get("SLOW", "0")))
-    real(temporary, folder)
-durable.put = slow
-from tightrope.cli.main import main
-sys.exit(main(sys.argv[1:]))
+SLOW = """
+import os, pkgutil, sys, time
+path, word, seconds = os.environ["SLOW"].split()
+owner, name = path.rsplit(".", 1)
+place = pkgutil.resolve_name(owner)
+real = getattr(place, name)
+def slow(*arguments, **keywords):
+    print(word, flush=True)
+    time.sleep(float(seconds))
+    return real(*arguments, **keywords)
+setattr(place, name, slow)
+from tightrope.__main__ import run
+run()
 """
+SAVING = "tightrope.runs.durable.put SAVING"
+COLLECTING = "tightrope.control.environments.pool.EnvironmentPool.receive COLLECTING 0.01"
+UPDATING = "tightrope.algorithms.ppo.update UPDATING 0.5"
+EVALUATING = "tightrope.control.evaluate.evaluate_agent EVALUATING 600"
 TRAIN = [
     "train", "Pendulum-v1", "--total-steps", "2_000_000", "--num-envs", "4", "--num-steps", "50",
     "--minibatch-size", "100", "--engine", "torch", "--vector-backend", "workers", "--num-workers", "2",
-    "--evaluate-every", "none", "--checkpoint-every", "0.0002",
+    "--keep-checkpoints", "none",
 ]  # fmt: skip
 
 
@@ -98,10 +143,13 @@ def alive(pid: int) -> bool:
 
 
 @contextlib.contextmanager
-def started(run: Path, slow: float) -> Iterator[subprocess.Popen]:
-    """A run in its own process, which always ends with the test."""
-    pipe, environment = subprocess.PIPE, {**os.environ, "SLOW": str(slow)}
-    words = [sys.executable, "-c", SLOW_SAVE, *TRAIN, "--run-dir", str(run)]
+def started(run: Path, slow: str, *more: str) -> Iterator[subprocess.Popen]:
+    """A run in its own process, which always ends with the test. ``slow``: a function, the word to print when
+    it is called, and the seconds to wait there.
+    """
+    pipe, environment = subprocess.PIPE, {**os.environ, "SLOW": slow}
+    more = more or ("--evaluate-every", "none", "--checkpoint-every", "0.0002")
+    words = [sys.executable, "-c", SLOW, *TRAIN, "--run-dir", str(run), *more]
     with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
         try:
             yield process
@@ -125,7 +173,7 @@ def until(process: subprocess.Popen, word: str, times: int = 1) -> None:
 @BOTH
 def test_a_stopped_run_finishes_its_save_and_names_everything(tmp_path, number, code):
     run = tmp_path / "a run"
-    with started(run, slow=0.5) as process:
+    with started(run, f"{SAVING} 0.5") as process:
         until(process, "SAVING", 2)
         workers = children(process.pid)
         assert workers
@@ -136,15 +184,16 @@ def test_a_stopped_run_finishes_its_save_and_names_everything(tmp_path, number, 
     assert process.returncode == code, err
     saved = sorted(path.name for path in (run / "checkpoints").iterdir())
     assert len(saved) == 2 and not list(run.rglob(".*")), "the save under way is whole, and nothing else is"
-    said = re.search(r"Stopped by (\w+) at step ([\d,]+)\. The newest valid checkpoint is (.*); 0 steps", err)
+    said = re.search(r"Stopped by (\w+) at step ([\d,]+)\. It is saved in (.*); what was", err)
     assert said is not None and said[1] == number.name and said[3].endswith(saved[-1]), err
+    assert "SIGINT: the save under way" in err or "SIGTERM: the save under way" in err
     command = shlex.split(err.strip().splitlines()[-1])
     assert command == ["tightrope", "resume", str(run)]
     assert not any(alive(pid) for pid in workers)
 
 
 def test_a_second_signal_leaves_the_older_checkpoint_and_no_temporaries(tmp_path):
-    with started(tmp_path / "run", slow=600) as process:
+    with started(tmp_path / "run", f"{SAVING} 600") as process:
         until(process, "SAVING")
         process.send_signal(signal.SIGTERM)
         time.sleep(0.5)
@@ -153,3 +202,59 @@ def test_a_second_signal_leaves_the_older_checkpoint_and_no_temporaries(tmp_path
         _, err = process.communicate(timeout=300)
     assert process.returncode == 143 and "There is no checkpoint yet" in err
     assert not any((tmp_path / "run" / "checkpoints").iterdir())
+
+
+@pytest.mark.parametrize("phase", [COLLECTING, UPDATING, EVALUATING], ids=lambda phase: phase.split()[1])
+def test_a_stopped_run_saves_its_newest_update(tmp_path, phase):
+    run, word = tmp_path / "run", phase.split()[1]
+    with started(run, phase, "--checkpoint-every", "none", "--evaluate-every", "0.0002") as process:
+        until(process, word, {"COLLECTING": 70, "UPDATING": 2, "EVALUATING": 1}[word])
+        process.send_signal(signal.SIGTERM)
+        begin = time.monotonic()
+        _, err = process.communicate(timeout=300)
+    assert time.monotonic() - begin < allowed(10)
+    assert process.returncode == 143, err
+    step = 200 if word == "COLLECTING" else 400
+    assert [path.name for path in (run / "checkpoints").iterdir()] == [f"step-{step:012d}"]
+    assert f"Stopped by SIGTERM at step {step}. It is saved in {run}" in err
+
+
+def test_ctrl_c_while_the_command_starts_prints_no_traceback():
+    """From the first line of our own code on; what Python does before it is Python's."""
+    script = (
+        "import sys; from tightrope.__main__ import run; import os, signal, threading, time\n"
+        "class Late:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'tightrope.cli.main':\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Late())\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "run()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
+
+
+TASK = """
+import threading, time
+import gymnasium
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
+class Threads(CartPoleEnv):
+    def __init__(self):
+        super().__init__()
+        threading.Thread(target=time.sleep, args=(600,), name="left behind").start()
+gymnasium.register("Threads-v0", Threads)
+"""
+
+
+def test_a_thread_that_an_environment_leaves_does_not_keep_the_process(tmp_path):
+    (tmp_path / "task.py").write_text(TASK)
+    words = ["train", "Threads-v0", "--total-steps", "64", "--num-envs", "1"]
+    words += ["--num-steps", "64", "--minibatch-size", "64", "--engine", "torch", "--evaluate-every", "none"]
+    words += ["--run-dir", str(tmp_path / "run"), "--json", "--env-module", str(tmp_path / "task.py")]
+    script = "import tightrope.__main__ as m; m.SECONDS_TO_END = 0.2; m.run()"
+    run = [sys.executable, "-c", script, *words]
+    ended = subprocess.run(run, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    assert '"steps": 64' in ended.stdout
+    assert "the process ends without waiting for the threads left behind" in ended.stderr

@@ -26,6 +26,7 @@ from tightrope.cli.options import (
 )
 from tightrope.cli.train_commands import require_transformers, resume, train
 from tightrope.errors import TightropeError
+from tightrope.runs import signals
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.records import printable
 
@@ -199,7 +200,7 @@ def main(words: list[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            with stdout_for_json(words):
+            with signals.stoppable(), stdout_for_json(words):
                 return _dispatch(words)
     except (TightropeError, ValueError, OSError, RuntimeError, FloatingPointError) as error:
         if isinstance(error, BrokenPipeError):
@@ -210,5 +211,5 @@ def main(words: list[str] | None = None) -> int:
             raise
         print(f"{PROGRAM}: {printable(str(error))}", file=sys.stderr)
         return CANNOT_WRITE if isinstance(error, CannotWrite) else 2
-    except KeyboardInterrupt:
-        return 130
+    except KeyboardInterrupt as error:
+        return error.code if isinstance(error, signals.Stopped) else 130

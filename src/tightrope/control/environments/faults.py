@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from tightrope.errors import TightropeError
+from tightrope.runs import signals
 
 FIRST_PAUSE = 0.05  # seconds before the first restart; doubled each time
 LONGEST_PAUSE = 2.0
@@ -70,8 +71,17 @@ class EnvironmentTimeout(BaseException):
     """
 
 
-# what counts as a fault of an environment; a signal to this process does not
-RAISED = (Exception, SystemExit, GeneratorExit, EnvironmentTimeout)
+# what counts as a fault of an environment; `raise_signal` leaves out what is a signal to this process
+RAISED = (Exception, SystemExit, GeneratorExit, KeyboardInterrupt, EnvironmentTimeout)
+
+
+def raise_signal(error: BaseException) -> None:
+    """Raise an error that is a signal to this process, or that took the place of one; another one is a fault
+    of the environment, also a KeyboardInterrupt of its own.
+    """
+    if signals.is_signal(error):
+        raise error
+    signals.raise_if_stopped()
 
 
 class FaultPolicy(NamedTuple):
@@ -162,7 +172,10 @@ def explained(
     action: str | None,
     advice: str = "",
 ) -> EnvironmentFault:
-    """The fault for an error of ``who``; the environment's own errors come with their traceback."""
+    """The fault for an error of ``who``; the environment's own errors come with their traceback. A signal is
+    raised again.
+    """
+    raise_signal(error)
     api = isinstance(error, ApiBreak)
     if isinstance(error, EnvironmentTimeout):
         what = f"was {error}"
@@ -179,7 +192,10 @@ def explained(
 
 
 def fault_while(doing: str, index: int, error: BaseException) -> EnvironmentFault:
-    """The fault for an error of an environment's own code in its constructor or in ``close``."""
+    """The fault for an error of an environment's own code in its constructor or in ``close``. A signal is
+    raised again.
+    """
+    raise_signal(error)
     what = "".join(traceback.format_exception(error)).rstrip()
     return EnvironmentFault(
         f"{doing} environment {index} raised {type(error).__name__}: {error}. Mend it there.\n{what}", index

@@ -26,6 +26,7 @@ from tightrope.control.environments.faults import (
     check_finite,
     explained,
     kind_of,
+    raise_signal,
     seed_of,
     wait_before_restart,
 )
@@ -369,6 +370,7 @@ class EnvGroup:
         try:
             return function(*arguments)
         except RAISED as error:
+            raise_signal(error)
             index = self.first + row
             raise EnvironmentFault(
                 f"the state of environment {index} ({self.name}) cannot be kept: {type(error).__name__}: "

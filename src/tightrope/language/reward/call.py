@@ -26,6 +26,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tightrope.errors import TightropeError
+from tightrope.runs import signals
 
 Text = str | list[dict[str, Any]]
 RewardFunction = Callable[..., Any]
@@ -178,14 +179,18 @@ class _Call:
         """Call a plain function and keep what it returns or raises; its values are read in the call too."""
         try:
             self._keep(_as_list(self.function(**self._arguments), self._count))
-        except (Exception, SystemExit) as error:  # user code: what it raises becomes a fault
+        except (Exception, SystemExit, KeyboardInterrupt) as error:  # user code: what it raises is a fault
+            if signals.is_signal(error):
+                raise
             self._keep(error)
 
     async def run_async(self) -> None:
         """The same for an async function."""
         try:
             self._keep(_as_list(await self.function(**self._arguments), self._count))
-        except (Exception, SystemExit, asyncio.CancelledError) as error:
+        except (Exception, SystemExit, KeyboardInterrupt, asyncio.CancelledError) as error:
+            if signals.is_signal(error):
+                raise
             self._keep(error)
 
     def _keep(self, back: list[Any] | BaseException) -> None:
