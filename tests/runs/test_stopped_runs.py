@@ -270,6 +270,16 @@ class Interrupts(Walk):
         return super().step(action)
 
 
+class InterruptsLater(Walk):
+    """Fails, and raises KeyboardInterrupt when it is closed after that."""
+
+    def step(self, action: int) -> Any:
+        raise ValueError("fails")
+
+    def close(self) -> None:
+        raise KeyboardInterrupt("at the end")
+
+
 class Takes(Walk):
     """Replaces the handlers of signals, and is then sent one."""
 
@@ -287,6 +297,16 @@ def test_a_keyboard_interrupt_of_an_environment_is_its_fault(tmp_path, backend):
         train.train(settings, run_dir=tmp_path / "run", env=Interrupts)
     with pytest.raises(EnvironmentFault, match="raised KeyboardInterrupt: not by a person"):
         tightrope.PPO(Interrupts, notify=lambda text: None, **SHORT).learn(1000)
+
+
+@pytest.mark.parametrize("backend", ["serial", "workers"])
+def test_nor_does_one_in_close_hide_the_fault_before_it(tmp_path, backend):
+    workers = {"vector_backend": backend, "num_workers": 2 if backend == "workers" else None}
+    settings = settings_for(
+        InterruptsLater, engine="torch", on_env_fault="restart", max_env_restarts=1, **workers
+    )
+    with pytest.raises(EnvironmentFault):
+        train.train(settings, run_dir=tmp_path / "run", env=InterruptsLater)
 
 
 def test_an_environment_that_turns_the_signal_into_another_error(tmp_path):

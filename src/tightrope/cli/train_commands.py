@@ -129,7 +129,7 @@ def _watched(command: str, given: Options, which: int, *args: Any, **values: Any
     view = VIEWS[command]
     shown = Display(view, stream, quiet=quiet, live=live)
     try:
-        with signals.stoppable(), shown:
+        with shown:
             ended = _functions(command)[which](*args, **values, listeners=[shown])
     except KeyboardInterrupt as error:
         again = _command("resume", shown.run, given) if shown.run else ""

@@ -30,6 +30,7 @@ from tightrope.training.tensorboard import require_tensorboard
 __all__ = ["resolve", "resume", "train"]
 
 
+@signals.stoppable()
 def train(
     settings: TrainSettings,
     *,
@@ -59,6 +60,7 @@ def train(
             return loop.train(learner, run, report)
 
 
+@signals.stoppable()
 def resume(
     run_dir: str | Path,
     *,

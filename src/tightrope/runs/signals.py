@@ -95,7 +95,7 @@ def _in_main_thread() -> bool:
 
 @contextlib.contextmanager
 def stoppable(*, only_ctrl_c: bool = False) -> Iterator[None]:
-    """Inside, SIGINT and SIGTERM raise `Stopped` as the head of this file says.
+    """Inside, SIGINT and SIGTERM raise `Stopped` as the head of this file says. Also a decorator.
 
     Only the main thread can handle signals. In another thread, or inside another `stoppable`, nothing
     changes. ``only_ctrl_c``: for a call in Python without a run folder. SIGTERM stays as it is, and so does

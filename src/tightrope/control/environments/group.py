@@ -24,6 +24,7 @@ from tightrope.control.environments.faults import (
     Restarts,
     action_text,
     check_finite,
+    close_environment,
     explained,
     kind_of,
     raise_signal,
@@ -330,8 +331,8 @@ class EnvGroup:
         make_all(self.makers[row : row + 1], fresh)
         check_alike(fresh, self.observation_layout, self.action_layout, self.name)
         if fresh[0] is not old:
-            with contextlib.suppress(Exception):
-                old.close()
+            with contextlib.suppress(EnvironmentFault):
+                close_environment(old, self.first + row)
         self.envs[row] = fresh[0]
 
     def _seed_of(self, row: int) -> int:

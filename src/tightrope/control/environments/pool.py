@@ -388,8 +388,8 @@ def _serve(
             channel.sendall(BROKEN + pack_json(fault.record()))
     finally:
         for env in envs:
-            with contextlib.suppress(Exception):
-                env.close()
+            with contextlib.suppress(EnvironmentFault):
+                close_environment(env, first)
         channel.close()
 
 

@@ -28,6 +28,7 @@ from tightrope.control.environments.faults import (
     FaultPolicy,
     action_text,
     check_finite,
+    close_environment,
     explained,
     kind_of,
     restart_seed,
@@ -309,7 +310,7 @@ class VectorEnvironments(Environments):
         def attempt() -> tuple[Inputs, np.ndarray | None]:
             self._restarts_here += 1
             wait_before_restart(self._restarts_here, self.policy)
-            with contextlib.suppress(Exception):
+            with contextlib.suppress(EnvironmentFault):
                 self._close_env()
             seed = self.seed_of(0)
             fresh = make(seed)
@@ -363,7 +364,7 @@ class VectorEnvironments(Environments):
 
     def _close_env(self) -> None:
         if self._env is not None and not self._keep:
-            self._env.close()
+            close_environment(self._env, 0)
         self._env = None
 
 

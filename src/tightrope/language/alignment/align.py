@@ -16,6 +16,7 @@ from tightrope.language.alignment.iteration import Trainer
 from tightrope.language.quiet import quiet_libraries
 from tightrope.language.settings import AlignSettings, recorded
 from tightrope.language.supervised.prepare import threads
+from tightrope.runs import signals
 from tightrope.runs.folders import require_kind
 from tightrope.runs.records import retyped
 from tightrope.runs.run import Run
@@ -42,6 +43,7 @@ class Aligned:
 
 
 @quiet_libraries()
+@signals.stoppable()
 def align(
     settings: AlignSettings | None = None,
     *,
@@ -90,6 +92,7 @@ def _train(trainer: Trainer, run: Run) -> Aligned:
 
 
 @quiet_libraries()
+@signals.stoppable()
 def resume_align(
     run_dir: str | Path,
     *,

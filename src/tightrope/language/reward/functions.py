@@ -36,6 +36,7 @@ from tightrope.language.reward.call import (
     describe_error,
     samples_text,
 )
+from tightrope.runs import signals
 
 # What is a mistake in the code raises by default; what the data or the world does masks the samples.
 RAISES: tuple[FaultKind, ...] = ("exception", "length", "type")
@@ -246,8 +247,10 @@ def load_reward_function(word: str) -> RewardFunction:
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
+    except (Exception, SystemExit, KeyboardInterrupt) as error:
         del sys.modules[spec.name]
+        if signals.is_signal(error):
+            raise
         raise RewardError(f"The reward {word!r}: the file cannot be run, {describe_error(error)}.") from error
     function = getattr(module, name, None)
     if not callable(function):
