@@ -24,7 +24,7 @@ from tightrope.control import train
 from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.language.alignment.align import align, resume_align
 from tightrope.language.reward.call import RewardError
-from tightrope.runs import signals
+from tightrope.runs import checkpoint, signals
 from tightrope.runs.checkpoint import step_of
 from tightrope.runs.run import Run
 from tightrope.training import parameters
@@ -453,3 +453,18 @@ def test_a_signal_in_every_phase_of_a_supervised_run(tmp_path, monkeypatch, supe
     resume(run, data=data)
     assert supervised_rows(run) == supervised_rows(whole)
     assert same_end(whole, run)
+
+
+def test_an_update_that_does_not_belong_there_is_refused(tmp_path, monkeypatch):
+    """Whoever signs a checkpoint again can write anything."""
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch, pytest.raises(signals.Stopped):
+        signal_in(patch, "tightrope.control.train.evaluate_agent", 1)
+        train.train(settings_for("CartPole-v1", engine="torch"), run_dir=run)
+    folder, tensors, state = Run.open(run).newest()
+    good = state["pending"]
+    assert good["step"] == 300
+    for wrong in ({}, [], 3, {**good, "step": "x"}, {**good, "episodes": [1]}, {**good, "more": 1}):
+        checkpoint.save(folder, tensors, {**state, "pending": wrong})
+        with pytest.raises(checkpoint.CheckpointError, match="does not hold what belongs there"):
+            train.resume(run)

@@ -40,15 +40,15 @@ class Update:
 
 def update_of(saved: dict[str, Any]) -> Update:
     """The update that a checkpoint holds as JSON."""
-    return Update(
-        int(saved["step"]),
-        int(saved["total_steps"]),
-        figures(saved["metrics"]),
-        int(saved["before"]),
-        bool(saved["on_grid"]),
-        [(float(r), int(n), bool(t)) for r, n, t in saved["episodes"]],
-        [dict(row) for row in saved["samples"]],
-    )
+    checked = {
+        **{name: int(saved[name]) for name in ("step", "total_steps", "before")},
+        "on_grid": bool(saved["on_grid"]),
+        "metrics": figures(saved["metrics"]),
+        "episodes": [(float(r), int(n), bool(t)) for r, n, t in saved["episodes"]],
+        "samples": [dict(row) for row in saved["samples"]],
+        "pause": 0.0,
+    }
+    return Update(**{**saved, **checked})
 
 
 class Learner(Protocol):

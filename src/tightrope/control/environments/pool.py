@@ -59,6 +59,7 @@ from tightrope.control.environments.processes import (
 from tightrope.control.environments.tasks import check_alike, make_all
 from tightrope.control.environments.watchdog import Watchdog
 from tightrope.control.spaces import Inputs, action_layout, observation_layout
+from tightrope.runs import signals
 
 
 @final
@@ -109,7 +110,8 @@ class EnvironmentPool(Environments):
                 self._close_all(envs)
                 envs = []
             for number in range(1, len(self._bounds) - 1):
-                self._workers.append(self._start(number))
+                with signals.uninterrupted():  # or nobody would end it
+                    self._workers.append(self._start(number))
             for worker in self._workers:
                 worker.wait()
         except BaseException:
