@@ -27,7 +27,7 @@ from tightrope.algorithms.settings import PPOSettings, UpdateSettings
 from tightrope.control.engine.base import limited_threads
 from tightrope.control.engine.choose import choose_engine, usable_device
 from tightrope.control.environments.base import Environments
-from tightrope.control.environments.faults import first_unusable, policy_of
+from tightrope.control.environments.faults import policy_of, require_finite
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
@@ -475,17 +475,6 @@ def _normalisers(environments: Environments, settings: TrainSettings) -> Normali
         RewardNormaliser(environments.num_envs, settings.update.gamma) if settings.normalise_rewards else None
     )
     return Normalisers(observations, rewards)
-
-
-def require_finite(inputs: Inputs) -> Inputs:
-    """The inputs as they are. ValueError for a NaN or an infinity, from which any action could follow."""
-    found = first_unusable(inputs["flat"]) if "flat" in inputs else None
-    if found is not None:
-        row, index = found
-        raise ValueError(
-            f"observation {row} holds {inputs['flat'][row, index]} at index {index}; expected finite numbers."
-        )
-    return inputs
 
 
 def _is_batched(layout: ObservationLayout, observation: Any) -> bool:

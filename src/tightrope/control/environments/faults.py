@@ -249,6 +249,17 @@ def first_unusable(numbers: Any) -> tuple[int, ...] | None:
     return None if good.all() else tuple(int(i) for i in np.argwhere(~good)[0])
 
 
+def require_finite(inputs: dict[str, Any]) -> dict[str, Any]:
+    """The inputs as they are. ValueError for a NaN or an infinity, from which any action could follow."""
+    found = first_unusable(inputs["flat"]) if "flat" in inputs else None
+    if found is not None:
+        row, index = found
+        raise ValueError(
+            f"observation {row} holds {inputs['flat'][row, index]} at index {index}; expected finite numbers."
+        )
+    return inputs
+
+
 def check_finite(what: str, numbers: Any) -> None:
     """ApiBreak for the first number that cannot be used (see `first_unusable`)."""
     index = first_unusable(numbers)
