@@ -24,7 +24,8 @@ KINDS: dict[str, str] = {
     "cartpole-kl-penalty": f"train CartPole-v1 {TRAIN} --total-steps 2048 --kl-beta 0.5 --kl-adapt 0.01",
     "pendulum-normalised": f"train Pendulum-v1 {TRAIN} --normalise-observations --normalise-rewards",
     "pendulum-gsde": f"train Pendulum-v1 {TRAIN} --std gsde --total-steps 2048",
-    "pendulum-state-squash": f"train Pendulum-v1 {TRAIN} --std state --squash --total-steps 2048",
+    "pendulum-state-squash": f"train Pendulum-v1 {TRAIN} --std state --action-bounds squash "
+    "--total-steps 2048",
     "masks-workers": f"train RulerShelf-v0 {OWN} {TRAIN} --vector-backend workers --num-workers 2",
     "image": f"train RulerPicture-v0 {OWN} {TRAIN} --num-steps 16 --total-steps 512 --num-epochs 1",
     "a2c": f"train CartPole-v1 {ONCE} --algorithm a2c",

@@ -41,7 +41,7 @@ def tightrope_settings(scenario: dict[str, Any]) -> dict[str, Any]:
         "activation": "tanh",
         "shared": False,
         "std": "independent",
-        "squash": False,
+        "action_bounds": "clip",
         "evaluate_every": None,
         "checkpoint_every": None,
     }

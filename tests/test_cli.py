@@ -340,6 +340,8 @@ def test_numbers_without_a_point_are_floats_where_floats_are_due() -> None:
         ("anneal_lr", "learning-rate-schedule"),
         ("no-norm-adv", "no-normalise-advantages"),
         ("use_sde", "std gsde"),
+        ("squash", "action-bounds squash"),
+        ("no-squash", "action-bounds"),
         ("net_arch", "hidden"),
         ("activation_fn", "activation"),
         ("normalize-observations", "normalise-observations"),

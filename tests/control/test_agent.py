@@ -23,7 +23,7 @@ def make(env="CartPole-v1", **values):
 
 
 @pytest.mark.parametrize("backend", ["serial", "vector"])
-@pytest.mark.parametrize("budget", [4, 127, 500, 1000])
+@pytest.mark.parametrize("budget", [8, 127, 500, 1000])
 def test_total_steps_are_never_exceeded_and_nearly_used(backend, budget):
     agent = make(vector_backend=backend).learn(budget)
     assert agent.steps <= budget

@@ -13,6 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.control.environments.make import Backend, choose_backend, make_environments
 from tightrope.control.environments.vector import autoreset_mode
+from tightrope.control.spaces.structure import Reading
 
 chain.register()
 COUNT = 40
@@ -256,8 +257,8 @@ def test_the_error_for_missing_envpool_names_the_package(monkeypatch):
 
 def test_squash_needs_bounds():
     with pytest.raises(ValueError, match="finite bounds"):
-        make_environments(Unbounded, 2, squash=True)
-    environments = make_environments("Pendulum-v1", 1, squash=True)
+        make_environments(Unbounded, 2, reading=Reading(action_bounds="squash"))
+    environments = make_environments("Pendulum-v1", 1, reading=Reading(action_bounds="squash"))
     environments.reset(0)
     environments.step(np.full((1, 1), 50.0, np.float32))
     assert environments._group.envs[0].unwrapped.last_u == pytest.approx(2.0)

@@ -217,9 +217,9 @@ def test_cut_episodes_are_not_counted_and_their_rewards_are_forgotten():
                           "num_steps": 50, "engine": "torch"})  # fmt: skip
     at_start, real = [], agent.collector.collect
 
-    def collect(engine: Any, columns: int) -> Any:
+    def collect(engine: Any, columns: int, warm_up: int) -> Any:
         at_start.append(bool(agent.normalisers.rewards.running.any()))
-        return real(engine, columns)
+        return real(engine, columns, warm_up)
 
     agent.collector.collect = collect  # type: ignore[method-assign]
     reports = list(agent.iterate())

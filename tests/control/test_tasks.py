@@ -177,7 +177,7 @@ def test_atari_uses_its_vector_version_with_same_step():
     gym.register_envs(ale_py)
     with make_environments("ALE/Pong-v5", 2) as environments:
         assert environments.backend == "vector"
-        assert environments.observation_layout.image_shapes == ((4, 84, 84),)
+        assert [leaf.space.shape for leaf in environments.observation_layout.images] == [(4, 84, 84)]
         inputs, mask = environments.reset(0)
         assert inputs["image0"].shape == (2, 4, 84, 84) and mask is None
         for _ in range(

@@ -460,7 +460,7 @@ def test_a_users_vector_environment_is_named_and_cannot_be_restarted(how, words)
     with pytest.raises(EnvironmentFault, match=words) as caught:
         agent.learn(1000)
     text = str(caught.value)
-    assert "at step 5" in text and "seed 5" in text and "last action [[" in text
+    assert "at step 5" in text and "seed 5" in text and "last action [" in text
     assert "cannot be restarted" in text and "Traceback" in text
     agent.close()
     vector.close()
@@ -471,6 +471,7 @@ def test_a_vector_version_of_an_id_is_restarted_with_all_its_copies():
     kinds = {"entry_point": lambda: Frail("no"), "vector_entry_point": FrailVector}
     gym.register("tightrope_tests/FrailVector-v0", **kinds)
     settings = {**SMALL, "num_envs": 2, "vector_backend": "vector", "on_env_fault": "restart"}
+    settings |= {"normalise_observations": False}  # no warm-up: the fault comes in the rollout
     try:
         agent = tightrope.PPO("tightrope_tests/FrailVector-v0", **settings, engine="torch")
         FrailVector.made = 1

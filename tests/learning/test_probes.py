@@ -120,7 +120,14 @@ def test_identity_in_every_space(name):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"squash": True}, {"std": "state"}, {"std": "gsde"}, {"std": "gsde", "squash": True}], ids=str
+    "changes",
+    [
+        {"action_bounds": "squash"},
+        {"std": "state"},
+        {"std": "gsde"},
+        {"std": "gsde", "action_bounds": "squash"},
+    ],
+    ids=str,
 )
 def test_identity_with_every_kind_of_gaussian(changes):
     values = {**FAST, **PLAIN, "hidden": (32, 32), "log_std_init": -0.5, "gamma": 0.5, **changes}

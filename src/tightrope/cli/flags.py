@@ -111,7 +111,9 @@ def suggestion(name: str, known: list[str]) -> str | None:
     peer = PEER_NAMES.get(name) or PEER_NAMES.get(name.rstrip("_"))
     meant = (british if british.replace("_", "-") in known else peer or "").replace("_", "-")
     if meant and meant.split()[0] in known:
-        return f"no-{meant}" if negated and f"no-{meant}" in known else meant
+        if negated:  # of a setting with a value, that value is what was not wanted
+            return f"no-{meant}" if f"no-{meant}" in known else meant.split()[0]
+        return meant
     return nearest(name.replace("_", "-"), known)
 
 

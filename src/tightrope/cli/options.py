@@ -36,8 +36,8 @@ PROGRAM = "tightrope"
 # The groups of train --help; every setting is in one.
 GROUPS = {
     "task": ("algorithm", "total_steps", "seed"),
-    "rollout": ("num_envs", "num_steps", "normalise_observations", "normalise_rewards"),
-    "networks": ("hidden", "activation", "shared", "std", "log_std_init", "gsde_steps", "squash"),
+    "rollout": ("num_envs", "num_steps", "action_bounds", "normalise_observations", "normalise_rewards"),
+    "networks": ("hidden", "activation", "shared", "encoder", "std", "log_std_init", "gsde_steps"),
     "update rule": (),
     "evaluation and saving": (
         "evaluate_every",

@@ -31,14 +31,15 @@ from tightrope.control.environments.faults import policy_of, require_finite
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
-from tightrope.control.policy.normalise import Normalisers, ObservationNormaliser, RewardNormaliser
+from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import require_room, resolve
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.episodes import FinishedEpisodes
-from tightrope.control.rollout.rollout import to_batch
+from tightrope.control.rollout.rollout import scale_metrics, to_batch
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import Array, Inputs, ObservationLayout, structure
+from tightrope.control.spaces.observations import ObservationLayout
+from tightrope.control.spaces.structure import Array, Inputs, Reading, structure
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint, signals
 from tightrope.training.events import Message
@@ -46,6 +47,7 @@ from tightrope.training.learner import Update, crosses
 from tightrope.training.memory import DoesNotFit
 from tightrope.training.parameters import Tensors, whole_update
 
+WARM_UP_STEPS = 512  # for the first statistics of observations: the initial policy acts, nothing is learnt
 MIN_COLUMNS = 16  # ten epochs on fewer steps than this would only add noise to a finished policy
 
 
@@ -76,13 +78,13 @@ class Agent:
         torch_device = usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
         self._require_room(present, policy)
-        threads = present.threads or (available_cores() if layouts[0].image_shapes else 1)
+        threads = present.threads or (available_cores() if layouts[0].images else 1)
         with limited_threads(threads):  # the QR of the first weights rounds differently with more threads
             self.policy = Policy(*layouts, present, policy).to(torch_device)
         self.optimiser = make_optimiser(
             self.policy.parameters(), self.policy.critic_parameters(), present.update
         )
-        self.normalisers = _normalisers(self.environments, present)
+        self.normalisers = Normalisers.of(layouts[0], self.environments.num_envs, present)
         self.cores = available_cores()
         self.engine, self.engine_line = choose_engine(
             self.policy, self.optimiser, present, self.cores, notify
@@ -104,7 +106,7 @@ class Agent:
     def without_effect(self, settings: TrainSettings) -> list[str]:
         """Which settings were changed and do nothing here."""
         found, box = settings.without_effect(), bool(self.environments.action_layout.gaussian.any())
-        usual = {"std": "independent", "squash": False}
+        usual = {"std": "independent", "action_bounds": "map"}
         return found + [
             f"{name} has no effect: the task has no Box action."
             for name, value in usual.items()
@@ -137,37 +139,42 @@ class Agent:
         and lets an update finish, or undoes a long one; the agent is then as it was between two updates.
         """
         budget = self.settings.total_steps if total_steps is None else total_steps
-        if start is None and budget < self.environments.num_envs:
-            raise ValueError(
-                f"{budget} steps are less than one in each of {self.environments.num_envs} environments; "
-                "expected at least that many. Give more steps, or fewer num_envs."
-            )
         start = self.steps if start is None else start
-        every = self.settings.checkpoint_every
-        while (columns := self._next_columns(budget, start)) > 0:
+        rows, ready = self.environments.num_envs, self.normalisers.ready
+        if start == self.steps and budget < (rows if ready else 2 * rows):
+            least = "one" if ready else "two, of which the first only gives statistics of observations,"
+            raise ValueError(
+                f"{budget} steps are less than {least} in each of {rows} environments; expected at least "
+                "that many. Give more steps, or fewer num_envs."
+            )
+        for note in [] if self.steps else self.environments.action_layout.not_mapped():
+            self.notify(note)
+        while (sizes := self._next_columns(budget, start))[1] > 0:
             before = self.steps - start
             # BLAS threads beside the engine's two only spin: its products are too small to share
             threads = 1 if self.engine.name == "fused" else self.settings.threads or 1
             with limited_threads(threads), self._whole_updates():
-                metrics, episodes = self._one_update(columns, before / budget)
+                metrics, episodes = self._one_update(*sizes, before / budget)
                 after = self.steps - start
-                on_grid = crosses(before, after, budget, every)
+                on_grid = crosses(before, after, budget, self.settings.checkpoint_every)
                 self.fresh = on_grid and not self.environments.gives_state
             yield Update(after, budget, metrics, before, on_grid, episodes)
 
     @contextlib.contextmanager
     def _whole_updates(self) -> Iterator[None]:
-        """Around an update. What ends it before it is complete (a signal, a fault) drops its rollout: the
-        random generators go back to where they were, and new episodes begin with the next rollout.
+        """Around an update. What ends it before it is complete (a signal, a fault) drops its rollout: random
+        generators and statistics go back to where they were, and new episodes begin with the next one.
         """
         generators = (self.sampling_rng, self.update_rng)
         with signals.stoppable(only_ctrl_c=True), signals.uninterrupted():
             before = [rng.bit_generator.state for rng in generators]
+            statistics = self.normalisers.state()
             try:
                 yield
             except BaseException:
                 for rng, state in zip(generators, before, strict=True):
                     rng.bit_generator.state = state
+                self.normalisers.load(statistics)
                 self.collector.drop()
                 self.fresh = True
                 raise
@@ -181,14 +188,21 @@ class Agent:
         self.policy.load_state_dict(tensors["policy"])
         restore_optimiser(self.optimiser, tensors["optimiser"])
 
-    def _next_columns(self, budget: int, start: int) -> int:
-        """Columns of the next rollout, within the budget; 0 when too few are left to learn from."""
-        columns = min(self.settings.num_steps, (budget - (self.steps - start)) // self.environments.num_envs)
-        enough = self.steps == start or columns >= min(MIN_COLUMNS, self.settings.num_steps)
-        return columns if enough else 0
+    def _next_columns(self, budget: int, start: int) -> tuple[int, int]:
+        """Columns of the warm-up, at most a tenth of what is left, and of the rollout behind it: whole
+        rollouts; (.., 0) when too few are left to learn from.
+        """
+        rows, most, warm_up = self.environments.num_envs, self.settings.num_steps, 0
+        left = (budget - (self.steps - start)) // rows
+        if not self.normalisers.ready:
+            warm_up = min(max(MIN_COLUMNS, -(-WARM_UP_STEPS // rows)), max(1, left // 10))
+            warm_up -= max(0, warm_up % most - most // 2)
+        columns = min(most - warm_up % most, left - warm_up)
+        enough = self.steps == start or columns >= min(MIN_COLUMNS, most)
+        return warm_up, columns if enough else 0
 
     def _one_update(
-        self, columns: int, progress: float
+        self, warm_up: int, columns: int, progress: float
     ) -> tuple[dict[str, float], list[tuple[float, int, bool]]]:
         """collect -> advantages -> update -> statistics."""
         present = self.settings.update.unchecked(**self.changes).at(progress)
@@ -199,13 +213,13 @@ class Agent:
         with signals.interruptible():
             if self.fresh:
                 self.collector.reset(self.settings.seed, self.steps)
-            rollout = self.collector.collect(self.engine, columns)
+            rollout = self.collector.collect(self.engine, columns, warm_up)
         collected = time.perf_counter()
         batch = to_batch(rollout, self.engine, self.normalisers, present)
-        metrics: dict[str, float] = {}
+        metrics = scale_metrics(rollout, self.environments, self.normalisers)
         if bool(batch.mask.any()):
             with whole_update(self._update_seconds, self._learned, self._unlearn):
-                metrics = self.engine.update(
+                metrics |= self.engine.update(
                     batch,
                     present,
                     self.update_rng,
@@ -256,8 +270,7 @@ class Agent:
         masks = layout.mask_of(observation) if action_masks is None else action_masks
         action_mask = flat_mask(masks, len(next(iter(inputs.values()))), actions)
         matrix = self.choose(inputs, action_mask, None if deterministic else self.predict_rng)
-        squash = self.settings.squash
-        return (actions.to_env(matrix, squash) if batched else actions.to_env_single(matrix[0], squash)), None
+        return (actions.to_env(matrix) if batched else actions.to_env_single(matrix[0])), None
 
     def value(self, observation: Any) -> Any:
         """The critic's V(s) in units of the return: a float for one observation, an array [N] for a batch."""
@@ -462,19 +475,9 @@ def _environments(env: Any, settings: TrainSettings) -> Environments:
     source = settings.env if env is None else env
     backend, workers, policy = settings.vector_backend, settings.num_workers, policy_of(settings)
     return make_environments(
-        source, settings.num_envs, backend=backend, num_workers=workers, squash=settings.squash, policy=policy
-    )
-
-
-def _normalisers(environments: Environments, settings: TrainSettings) -> Normalisers:
-    layout = environments.observation_layout
-    observations = (
-        ObservationNormaliser(layout.continuous) if settings.normalise_observations and layout.size else None
-    )
-    rewards = (
-        RewardNormaliser(environments.num_envs, settings.update.gamma) if settings.normalise_rewards else None
-    )
-    return Normalisers(observations, rewards)
+        source, settings.num_envs, backend=backend, num_workers=workers, policy=policy,
+        reading=Reading.of(settings),
+    )  # fmt: skip
 
 
 def _is_batched(layout: ObservationLayout, observation: Any) -> bool:

@@ -12,6 +12,7 @@ from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
+from tightrope.control.spaces.structure import Reading
 
 MAX_COPIES = 10
 SHORTEST_LIMIT = 1_000  # steps that an episode may always have
@@ -123,6 +124,6 @@ def evaluation_environments(env: Any, settings: TrainSettings, episodes: int) ->
         source,
         min(episodes, MAX_COPIES),
         backend=backend,
-        squash=settings.squash,
         policy=policy_of(settings),
+        reading=Reading.of(settings),
     )

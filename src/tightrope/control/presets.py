@@ -124,6 +124,7 @@ def preset(
             "learning_rate": 2.5e-4,
             "hidden": (),
             "shared": True,
+            "normalise_observations": True,  # what lies beside the images
             "normalise_rewards": True,
         }
         values |= {"num_epochs": 4, "minibatch_size": 256, "clip": 0.1} if algorithm == "ppo" else {}

@@ -11,7 +11,8 @@ from tightrope.control.presets import BY_TASK, preset
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 
 if TYPE_CHECKING:
-    from tightrope.control.spaces import ActionLayout, ObservationLayout
+    from tightrope.control.spaces.actions import ActionLayout
+    from tightrope.control.spaces.observations import ObservationLayout
 
 STEP_BYTES = 48  # of a step beside its observation and action: rewards, values, advantages, flags, twice
 
@@ -38,7 +39,7 @@ def resolve_with_preset(
     if env_id in BY_TASK[algorithm]:
         chosen, limit = preset(env_id, algorithm), time_limit(env)
     else:
-        kind, limit = _describe(env)
+        kind, limit = _describe(env, values.get("encoder", "auto"))
         chosen = preset(env_id, algorithm, kind, limit)
     num_envs = getattr(env, "num_envs", None)  # a vector environment has its own number of copies
     if num_envs is not None:
@@ -64,11 +65,12 @@ def _checkpoint_interval(episode: float) -> float:
     return min(1.0, max(TrainSettings.checkpoint_every or 1.0, math.ceil(1000 * episode) / 1000))
 
 
-def _describe(env: Any) -> tuple[str, int | None]:
+def _describe(env: Any, encoder: str) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
     from tightrope.control.environments.faults import close_environment
     from tightrope.control.environments.tasks import make_all, make_vector_by_id, makers_of, time_limit
-    from tightrope.control.spaces import action_layout, observation_layout
+    from tightrope.control.spaces.actions import action_layout
+    from tightrope.control.spaces.observations import observation_layout
 
     made: list[Any] = []
     if isinstance(env, str) and env.startswith("ALE/"):
@@ -80,12 +82,14 @@ def _describe(env: Any) -> tuple[str, int | None]:
             stack.callback(close_environment, made[0], 0)
         task = made[0] if made else env
         vector = hasattr(task, "single_observation_space")
-        observations = observation_layout(task.single_observation_space if vector else task.observation_space)
+        observations = observation_layout(
+            task.single_observation_space if vector else task.observation_space, encoder
+        )
         actions = action_layout(task.single_action_space if vector else task.action_space)
         limit = time_limit(env if isinstance(env, str) else task)
-    if observations.image_shapes:
+    if observations.images:
         return "images", limit
-    continuous = all(component.kind == "gaussian" for component in actions.components)
+    continuous = any(component.kind == "gaussian" for component in actions.components)  # mixed ones too
     return ("continuous" if continuous else "discrete"), limit
 
 
@@ -102,11 +106,11 @@ def require_room(
     from tightrope.training.memory import SHARE, DoesNotFit, available_memory
 
     size = 1 if observations is None else observations.size
-    pixels = 0 if observations is None else sum(math.prod(shape) for shape in observations.image_shapes)
+    one = {} if observations is None else observations.allocate(1)
+    pixels = sum(x.nbytes for name, x in one.items() if name.startswith("image"))
     columns = 1 if actions is None else actions.num_columns + actions.num_logits
     steps = settings.num_envs * settings.num_steps
-    copies = 2 if settings.normalise_observations else 1
-    rollout = steps * (STEP_BYTES + 4 * (copies * size + columns) + pixels)
+    rollout = steps * (STEP_BYTES + (8 + 4) * size + 4 * columns + pixels)  # raw and seen
     weights = 0
     if not own_policy:
         half = sum((n + 1) * m for n, m in pairwise([size, *settings.hidden, columns]))

@@ -54,6 +54,25 @@ _TABLE = (
         "restart alone.",
         high=0.0,
     ),
+    metric(
+        "rollout/action_clip_fraction",
+        "fraction",
+        "any",
+        "Share of the policy's numbers for bounded Box actions that lie outside the bounds and were cut off "
+        "there; near 1: the policy only pushes against its bounds. None of these numbers with action_bounds "
+        "squash.",
+        low=0.0,
+        high=0.9,
+    ),
+    metric(
+        "rollout/observation_outlier_fraction",
+        "fraction",
+        "down",
+        "Share of normalised observation numbers beyond 10 deviations, where they grow as a logarithm only; "
+        "often above 0.01: their scale still changes, or it has heavy tails.",
+        low=0.0,
+        high=0.01,
+    ),
     metric("time/fps", "steps/s", "up", "Agent steps per second of this update."),
     metric("time/seconds", "s", "any", "Seconds of training so far; evaluations and saving are not counted."),
     metric("time/env_seconds", "s", "down", "Seconds of this update that the environments took."),

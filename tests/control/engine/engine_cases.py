@@ -9,7 +9,8 @@ from tightrope.algorithms.optimise import make_optimiser
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.control.policy.policy import Policy
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import action_layout, observation_layout
+from tightrope.control.spaces.actions import action_layout
+from tightrope.control.spaces.observations import observation_layout
 
 FEATURES = 5
 SPACES = {

@@ -18,10 +18,10 @@ from tightrope.maths import returns
 def test_act_is_torchs_with_the_same_noise(space, shared, rows, masked):
     policy, optimiser, _ = make(space, shared=shared)
     engine, rng = CompiledEngine(policy, optimiser, 1), np.random.default_rng(0)
-    layout, raw = policy.layout, rng.standard_normal((rows, FEATURES), dtype=np.float32)
-    normaliser = ObservationNormaliser(np.ones(FEATURES, bool))
-    normaliser.mean, normaliser.inverse_std = rng.random((2, FEATURES), dtype=np.float32) + 0.5
-    normaliser.inverse_std *= 8  # some are clipped
+    layout, raw = policy.layout, rng.standard_normal((rows, FEATURES))
+    normaliser = ObservationNormaliser(np.ones(FEATURES, bool), old=masked)
+    normaliser.mean, normaliser.inverse_std = rng.random((2, FEATURES)) + 0.5
+    normaliser.inverse_std *= 8  # some lie beyond the edge
     noise = make_noise(layout, rows, rng)
     masks = make_masks(layout, rows, rng) if masked and layout.num_logits else None
     rollout = np.zeros((rows, 3, layout.num_columns), np.float32)
@@ -43,7 +43,7 @@ def test_act_is_torchs_with_the_same_noise(space, shared, rows, masked):
 
 def test_without_normalisation_inputs_are_the_observations():
     policy, optimiser, _ = make()
-    raw, out = np.full((2, FEATURES), 50, np.float32), np.zeros((2, FEATURES), np.float32)
+    raw, out = np.full((2, FEATURES), 50.0), np.zeros((2, FEATURES), np.float32)
     noise, actions, logp = np.zeros((2, 1), np.float32), np.zeros((2, 1), np.float32), np.zeros(2, np.float32)
     engine = CompiledEngine(policy, optimiser, 1)
     engine.act({"flat": raw}, None, None, noise, slice(0, 2), Acted({"flat": out}, actions, logp))

@@ -13,7 +13,7 @@ from threadpoolctl import ThreadpoolController
 from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import UpdateSettings
 from tightrope.control.policy.normalise import ObservationNormaliser
-from tightrope.control.spaces import Array, Inputs
+from tightrope.control.spaces.structure import Array, Inputs
 
 _controller: ThreadpoolController | None = None
 

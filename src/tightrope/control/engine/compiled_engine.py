@@ -17,15 +17,15 @@ from tightrope.algorithms.settings import PPOSettings, UpdateSettings
 from tightrope.control.engine.base import Acted, Steps
 from tightrope.control.engine.compiled import cache, infer, plan, threads
 from tightrope.control.engine.compiled import update as kernels
-from tightrope.control.policy.normalise import CLIP, ObservationNormaliser
+from tightrope.control.policy.normalise import EDGE, ObservationNormaliser
 from tightrope.control.policy.policy import Policy
-from tightrope.control.spaces import Array, Inputs
+from tightrope.control.spaces.structure import Array, Inputs
 
 cache.mark_complete()  # importing infer and update has compiled or loaded every entry
 
 CHECK_LIMIT = 1e-4  # largest difference of a parameter after one minibatch
 CHECK_CLIP = 1e-3  # smallest clip in that comparison: within rounding, either side of a clip is right
-_NOTHING = np.zeros(0, np.float32)
+_NOTHING = np.zeros(0)
 _NO_MASK = np.zeros((0, 1), bool)
 
 # For the comparison with ppo.py: an Adam whose step is nearly the gradient itself. With its usual tiny
@@ -121,12 +121,12 @@ class CompiledEngine:
         if action_mask is not None:
             masks = action_mask[rows]
             out.inputs["action_mask"][:] = masks
-        mean, inverse_std = _NOTHING, _NOTHING
+        mean, inverse_std, hard = _NOTHING, _NOTHING, False
         if normaliser is not None:
-            mean, inverse_std = normaliser.mean, normaliser.inverse_std
+            mean, inverse_std, hard = normaliser.mean, normaliser.inverse_std, normaliser.old
         infer.act_batch(
             p.places, p.layers, p.components, self._flat, self._work[0], inputs["flat"][rows], mean,
-            inverse_std, CLIP, masks, noise[rows], out.actions, out.logp, out.inputs["flat"],
+            inverse_std, EDGE, hard, masks, noise[rows], out.actions, out.logp, out.inputs["flat"],
         )  # fmt: skip
 
     def values(self, inputs: Inputs) -> Array:

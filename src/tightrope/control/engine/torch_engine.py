@@ -15,7 +15,7 @@ from tightrope.control.engine.base import Acted, Steps
 from tightrope.control.policy.normalise import ObservationNormaliser
 from tightrope.control.policy.policy import Policy
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import Array, Inputs
+from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.maths import returns
 
 ALGORITHMS = {"ppo": ppo, "a2c": a2c, "reinforce": reinforce}

@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tightrope.control.environments.faults import FaultPolicy, Restarts
-from tightrope.control.spaces import ActionLayout, Inputs, ObservationLayout
+from tightrope.control.spaces.actions import ActionLayout
+from tightrope.control.spaces.observations import ObservationLayout
+from tightrope.control.spaces.structure import Inputs
 
 
 class Step(NamedTuple):
@@ -37,7 +39,6 @@ class Environments(ABC):
     spec_id: str
     max_episode_steps: int | None
     num_workers: int = 1
-    squash: bool = False
     gives_state: bool  # whether the environments can give their state (see state.py)
     num_envs: int
     observation_layout: ObservationLayout

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from tightrope.control.spaces.structure import float_parts
 from tightrope.errors import TightropeError
 from tightrope.runs import signals
 
@@ -251,12 +252,13 @@ def first_unusable(numbers: Any) -> tuple[int, ...] | None:
 
 def require_finite(inputs: dict[str, Any]) -> dict[str, Any]:
     """The inputs as they are. ValueError for a NaN or an infinity, from which any action could follow."""
-    found = first_unusable(inputs["flat"]) if "flat" in inputs else None
-    if found is not None:
-        row, index = found
-        raise ValueError(
-            f"observation {row} holds {inputs['flat'][row, index]} at index {index}; expected finite numbers."
-        )
+    for numbers in float_parts(inputs):
+        found = first_unusable(numbers)
+        if found is not None:
+            row, index = found
+            raise ValueError(
+                f"observation {row} holds {numbers[row, index]} at index {index}; expected finite numbers."
+            )
     return inputs
 
 

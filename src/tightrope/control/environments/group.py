@@ -34,14 +34,9 @@ from tightrope.control.environments.faults import (
 from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, find_source
 from tightrope.control.environments.success import success_of
 from tightrope.control.environments.tasks import check_alike, make_all
-from tightrope.control.spaces import (
-    MASK_KEY,
-    ActionLayout,
-    Inputs,
-    ObservationLayout,
-    action_layout,
-    observation_layout,
-)
+from tightrope.control.spaces.actions import ActionLayout, action_layout
+from tightrope.control.spaces.observations import ObservationLayout, observation_layout
+from tightrope.control.spaces.structure import MASK_KEY, Inputs, Reading, float_parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +48,7 @@ class StepBuffers:
 
     inputs: Inputs
     final_inputs: Inputs
-    actions: np.ndarray  # float32 [N, A], already squashed where that was asked for
+    actions: np.ndarray  # float32 [N, A], as sampled
     rewards: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
@@ -132,6 +127,7 @@ class EnvGroup:
         makers: Sequence[Callable[[], gym.Env]] = (),
         policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
         worker: int = 0,
+        reading: Reading = Reading(),  # noqa: B008
     ) -> None:
         self.envs = list(envs)
         self.buffers = buffers
@@ -141,8 +137,8 @@ class EnvGroup:
         self.makers = makers
         self.policy = policy
         self.restarts = Restarts(policy)
-        self.observation_layout = observation_layout(envs[0].observation_space)
-        self.action_layout = action_layout(envs[0].action_space)
+        self.observation_layout = observation_layout(envs[0].observation_space, reading.encoder)
+        self.action_layout = action_layout(envs[0].action_space, reading.action_bounds)
         self.has_masks = False
         self._mask_sources = [MaskSource()] * len(envs)
         self._shape = envs[0].observation_space.shape
@@ -275,8 +271,8 @@ class EnvGroup:
 
     @staticmethod
     def _check_row(inputs: Inputs, what: str) -> None:
-        if "flat" in inputs:
-            check_finite(what, inputs["flat"][0])
+        for numbers in float_parts(inputs):
+            check_finite(what, numbers[0])
 
     # ------------------------------------------------------------------------------------------------- masks
 

@@ -13,6 +13,7 @@ from tightrope.control.environments.faults import FaultPolicy
 from tightrope.control.environments.pool import EnvironmentPool
 from tightrope.control.environments.processes import available_cores
 from tightrope.control.environments.vector import VectorEnvironments, is_vector_env
+from tightrope.control.spaces.structure import Reading
 
 BACKENDS = ("auto", "serial", "workers", "vector", "envpool")
 # A step of these takes tens of microseconds: long enough for a worker process to save time.
@@ -55,38 +56,32 @@ def make_environments(
     *,
     backend: str = "auto",
     num_workers: int | None = None,
-    squash: bool = False,
     policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
+    reading: Reading = Reading(),  # noqa: B008
 ) -> Environments:
     """``num_envs`` environments from a Gymnasium id, an instance, a factory, or a vector environment.
 
     ``num_envs`` None: 1, or what the vector environment has. A given instance or vector environment is
     stepped but never closed. ``policy``: what happens after a fault. ValueError: an unknown id, a backend
-    that the task does not have, an instance that cannot be replicated, spaces that are not supported.
+    that the task does not have, an instance that cannot be replicated, spaces that are not supported or
+    cannot be read as ``reading`` asks.
     """
     if backend not in BACKENDS:
         raise ValueError(f"vector backend is {backend!r}; expected one of: {', '.join(BACKENDS)}.")
     if is_vector_env(env):
         chosen = Backend("given")
         environments: Environments
-        environments = _given(env, num_envs, backend, policy)
+        environments = _given(env, num_envs, backend, policy, reading)
     else:
         num_envs = 1 if num_envs is None else num_envs
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; expected at least 1.")
         chosen = _resolve(env, num_envs, backend, num_workers)
         if isinstance(env, str) and chosen.name in ("vector", "envpool"):
-            environments = _vector_version(env, num_envs, chosen.name, policy)
+            environments = _vector_version(env, num_envs, chosen.name, policy, reading)
         else:
-            environments = _pool(env, num_envs, chosen.num_workers, policy)
+            environments = _pool(env, num_envs, chosen.num_workers, policy, reading)
     environments.backend, environments.num_workers = chosen
-    if squash:
-        try:
-            environments.action_layout.check_squash()
-        except ValueError:
-            environments.close()
-            raise
-        environments.squash = True
     return environments
 
 
@@ -112,29 +107,34 @@ def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> 
     return Backend("serial") if chosen.name == "vector" else chosen
 
 
-def _pool(env: Any, num_envs: int, num_groups: int, policy: FaultPolicy) -> EnvironmentPool:
+def _pool(env: Any, num_envs: int, num_groups: int, policy: FaultPolicy, reading: Reading) -> EnvironmentPool:
     makers, given = tasks.makers_of(env, num_envs), isinstance(env, gym.Env)
-    pool = EnvironmentPool(makers, num_groups, tasks.name_of(env), keep_first=given, policy=policy)
+    name = tasks.name_of(env)
+    pool = EnvironmentPool(makers, num_groups, name, keep_first=given, policy=policy, reading=reading)
     if isinstance(env, str):
         pool.spec_id = env
     return pool
 
 
-def _vector_version(env_id: str, num_envs: int, backend: str, policy: FaultPolicy) -> VectorEnvironments:
+def _vector_version(
+    env_id: str, num_envs: int, backend: str, policy: FaultPolicy, reading: Reading
+) -> VectorEnvironments:
     """The task's own vector version, or EnvPool's."""
     if backend == "vector":
         make = lambda seed: tasks.make_vector_by_id(env_id, num_envs)  # noqa: E731
         vector = make(0)
-        environments = VectorEnvironments(lambda seed: vector, env_id, policy, make)
+        environments = VectorEnvironments(lambda seed: vector, env_id, policy, make, reading=reading)
     else:
         threads = min(num_envs, available_cores())
         make = lambda seed: tasks.make_envpool(env_id, num_envs, seed, threads)  # noqa: E731
-        environments = VectorEnvironments(make, env_id, policy, make, int32_actions=True)
+        environments = VectorEnvironments(make, env_id, policy, make, int32_actions=True, reading=reading)
     environments.max_episode_steps = tasks.time_limit(env_id)
     return environments
 
 
-def _given(env: Any, num_envs: int | None, backend: str, policy: FaultPolicy) -> VectorEnvironments:
+def _given(
+    env: Any, num_envs: int | None, backend: str, policy: FaultPolicy, reading: Reading
+) -> VectorEnvironments:
     """A vector environment that the user gave as an object."""
     if num_envs not in (None, int(env.num_envs)):
         raise ValueError(
@@ -146,7 +146,7 @@ def _given(env: Any, num_envs: int | None, backend: str, policy: FaultPolicy) ->
         )
     envpool = not isinstance(env, gym.vector.VectorEnv)
     environments = VectorEnvironments(
-        lambda seed: env, tasks.name_of(env), policy, keep=True, int32_actions=envpool
+        lambda seed: env, tasks.name_of(env), policy, keep=True, int32_actions=envpool, reading=reading
     )
     environments.max_episode_steps = tasks.time_limit(env)
     return environments

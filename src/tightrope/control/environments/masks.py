@@ -15,7 +15,9 @@ import gymnasium as gym
 import numpy as np
 
 from tightrope.control.environments.faults import ApiBreak
-from tightrope.control.spaces import MASK_KEY, ActionLayout, ObservationLayout
+from tightrope.control.spaces.actions import ActionLayout
+from tightrope.control.spaces.observations import ObservationLayout
+from tightrope.control.spaces.structure import MASK_KEY
 
 METHOD = "action_masks"
 MISSING = f"info has no {MASK_KEY!r} although reset gave one; give it at every reset and every step"

@@ -58,7 +58,9 @@ from tightrope.control.environments.processes import (
 )
 from tightrope.control.environments.tasks import check_alike, make_all
 from tightrope.control.environments.watchdog import Watchdog
-from tightrope.control.spaces import Inputs, action_layout, observation_layout
+from tightrope.control.spaces.actions import action_layout
+from tightrope.control.spaces.observations import observation_layout
+from tightrope.control.spaces.structure import Inputs, Reading
 from tightrope.runs import signals
 
 
@@ -79,9 +81,11 @@ class EnvironmentPool(Environments):
         *,
         keep_first: bool = False,
         policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
+        reading: Reading = Reading(),  # noqa: B008
     ) -> None:
         super().__init__(policy)
         self.name = name
+        self._reading = reading
         self.num_envs = len(makers)
         self._makers = makers
         self._keep = 1 if keep_first else 0
@@ -105,7 +109,9 @@ class EnvironmentPool(Environments):
             self._allocate(shared=num_groups > 1)
             if here:
                 buffers = self._buffers.map(lambda array: array[:here])
-                self._group = EnvGroup(envs, buffers, name, makers=makers[:here], policy=policy)
+                self._group = EnvGroup(
+                    envs, buffers, name, makers=makers[:here], policy=policy, reading=reading
+                )
             else:  # it was made for its spaces only
                 self._close_all(envs)
                 envs = []
@@ -126,8 +132,8 @@ class EnvironmentPool(Environments):
         spec = envs[0].spec
         self.spec_id = spec.id if spec is not None else type(envs[0].unwrapped).__name__
         self.max_episode_steps = getattr(spec, "max_episode_steps", None)
-        self.observation_layout = observation_layout(envs[0].observation_space)
-        self.action_layout = action_layout(envs[0].action_space)
+        self.observation_layout = observation_layout(envs[0].observation_space, self._reading.encoder)
+        self.action_layout = action_layout(envs[0].action_space, self._reading.action_bounds)
         self.gives_state = states.gives_state(envs[0])
         check_alike(envs, self.observation_layout, self.action_layout, self.name)
 
@@ -147,8 +153,9 @@ class EnvironmentPool(Environments):
         first, last = self._bounds[number : number + 2]
         spin = SPIN if len(self._bounds) - 1 <= available_cores() else 0.0
         makers = self._makers[first:last]
+        how = (self.policy, self._reading)
         return WorkerProcess(
-            self._context, _serve, makers, self._shared, first, number, self.name, spin, self.policy
+            self._context, _serve, makers, self._shared, first, number, self.name, spin, *how
         )
 
     def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
@@ -175,7 +182,7 @@ class EnvironmentPool(Environments):
     def send(self, rows: slice, actions: np.ndarray) -> None:
         """See Environments."""
         self._under_way = True
-        self._buffers.actions[rows] = self.action_layout.squashed(actions) if self.squash else actions
+        self._buffers.actions[rows] = actions
         if rows.stop > self._bounds[1]:
             for worker in self._workers:
                 worker.send(STEP)
@@ -360,6 +367,7 @@ def _serve(
     name: str,
     spin: float,
     policy: FaultPolicy,
+    reading: Reading,
 ) -> None:
     """What a worker does: make its environments, then execute commands until CLOSE."""
     # Ctrl-C reaches the whole process group; the main process ends its workers in order
@@ -371,7 +379,9 @@ def _serve(
     try:
         make_all(makers.fn, envs, first)
         buffers = shared.map(SharedArray.view).map(lambda array: array[first : first + len(envs)])
-        group = EnvGroup(envs, buffers, name, first, makers=makers.fn, policy=policy, worker=number)
+        group = EnvGroup(
+            envs, buffers, name, first, makers=makers.fn, policy=policy, worker=number, reading=reading
+        )
         envs = group.envs
         _check_buffers(group, buffers)
         channel.sendall(READY)

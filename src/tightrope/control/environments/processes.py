@@ -25,6 +25,7 @@ import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy
+from tightrope.control.spaces.structure import Reading
 
 COMMAND = struct.Struct("<cq")  # one of the following, and a number: a seed, or how many bytes of data follow
 RESET, STEP, GET_STATE, SET_STATE, SETTLE, CLOSE = b"r", b"s", b"g", b"p", b"t", b"c"
@@ -82,6 +83,7 @@ class WorkerProcess:
         name: str,
         spin: float,
         policy: FaultPolicy,
+        reading: Reading,
     ) -> None:
         self.first = first
         self.number = number
@@ -94,7 +96,7 @@ class WorkerProcess:
         carried = CloudpickleWrapper(list(makers))  # type: ignore[arg-type]
         self._process = context.Process(  # type: ignore[attr-defined]
             target=serve,
-            args=(theirs, carried, shared, first, number, name, spin, policy),
+            args=(theirs, carried, shared, first, number, name, spin, policy, reading),
             daemon=True,
             name=f"tightrope-worker-{first}",
         )

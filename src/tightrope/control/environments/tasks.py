@@ -16,12 +16,9 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from tightrope.control.environments.faults import RAISED, fault_while, raised_here
-from tightrope.control.spaces import (
-    ActionLayout,
-    ObservationLayout,
-    action_layout,
-    observation_layout,
-)
+from tightrope.control.spaces.actions import ActionLayout
+from tightrope.control.spaces.observations import ObservationLayout
+from tightrope.control.spaces.structure import bounds_of, structure
 
 # namespace or entry point module -> the module that must be there, and our extra that installs it
 EXTRAS = {
@@ -252,11 +249,11 @@ def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env], first
 def check_alike(
     envs: Sequence[gym.Env], observations: ObservationLayout, actions: ActionLayout, name: str
 ) -> None:
-    """ValueError when the copies do not all have observations and actions of the same shape."""
+    """ValueError when the copies' observations or actions differ in shape, or the bounds of actions."""
     for env in envs:
-        other, theirs = observation_layout(env.observation_space), action_layout(env.action_space)
-        same = (observations.size, observations.image_shapes) == (other.size, other.image_shapes)
-        if not same or theirs.components != actions.components:
+        pairs = ((observations.space, env.observation_space), (actions.space, env.action_space))
+        same = all(structure(ours) == structure(theirs) for ours, theirs in pairs)
+        if not same or bounds_of(env.action_space) != bounds_of(actions.space):
             raise ValueError(
                 f"the copies of {name} differ: {env.observation_space}, {env.action_space} against "
                 f"{observations.space}, {actions.space}. All copies must have the same spaces."

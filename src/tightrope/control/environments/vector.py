@@ -37,7 +37,9 @@ from tightrope.control.environments.faults import (
 from tightrope.control.environments.masks import find_source, vector_masks
 from tightrope.control.environments.success import SUCCESS_KEY, vector_success
 from tightrope.control.environments.watchdog import Watchdog
-from tightrope.control.spaces import Inputs, action_layout, observation_layout
+from tightrope.control.spaces.actions import action_layout
+from tightrope.control.spaces.observations import observation_layout
+from tightrope.control.spaces.structure import Inputs, Reading, float_parts
 
 # the second is a typing error in some of Gymnasium's environments
 MODE_KEYS = ("autoreset_mode", "autoreseet-mode")
@@ -90,6 +92,7 @@ class VectorEnvironments(Environments):
         *,
         keep: bool = False,
         int32_actions: bool = False,
+        reading: Reading = Reading(),  # noqa: B008 - it cannot be changed
     ) -> None:
         super().__init__(policy)
         self.name = name
@@ -99,8 +102,8 @@ class VectorEnvironments(Environments):
         self._keep = keep
         self._int32 = int32_actions
         self._use(make(0))
-        self.observation_layout = observation_layout(self._env.single_observation_space)
-        self.action_layout = action_layout(self._env.single_action_space)
+        self.observation_layout = observation_layout(self._env.single_observation_space, reading.encoder)
+        self.action_layout = action_layout(self._env.single_action_space, reading.action_bounds)
         self.gives_state = states.gives_state(self._env)
         self.row_groups = (slice(0, self.num_envs),)  # they are stepped together
         self._seed = 0
@@ -160,7 +163,7 @@ class VectorEnvironments(Environments):
 
     def send(self, rows: slice, actions: np.ndarray) -> None:
         """See Environments."""
-        self._actions = self.action_layout.squashed(actions) if self.squash else actions
+        self._actions = actions
 
     def receive(self) -> Step:
         """Step all rows with the actions sent; after a fault all episodes are cut."""
@@ -184,8 +187,8 @@ class VectorEnvironments(Environments):
             self._in_call = False
 
     def _check_finite(self, inputs: Inputs, what: str) -> None:
-        if self.policy.restart and "flat" in inputs:
-            check_finite(what, inputs["flat"])
+        for numbers in float_parts(inputs) if self.policy.restart else ():
+            check_finite(what, numbers)
 
     def _step(self) -> Step:
         actions = self.action_layout.to_env(self._actions)
@@ -334,9 +337,14 @@ class VectorEnvironments(Environments):
             env_id=self.name,
             worker=0,
             seed=self.seed_of(0),
-            action=action_text(self._actions.tolist()) if self._count else None,
+            action=action_text(self._given(index)) if self._count else None,
             advice=advice,
         )
+
+    def _given(self, index: int) -> Any:
+        """The last actions of all rows, or of one, as the environment got them."""
+        layout = self.action_layout
+        return layout.to_env(self._actions) if index < 0 else layout.to_env_single(self._actions[index])
 
     def seed_of(self, row: int) -> int:
         """The one seed of all rows."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tightrope.control.spaces import ActionLayout, Component
+from tightrope.control.spaces.actions import ActionLayout, Component
 from tightrope.maths import divergence
 
 LOG_STD_RANGE = (-20.0, 2.0)

@@ -9,45 +9,72 @@ import numpy as np
 import torch
 
 from tightrope.algorithms.nonfinite import require_restorable
-from tightrope.control.spaces import Array, Inputs
+from tightrope.control.settings import TrainSettings
+from tightrope.control.spaces.observations import ObservationLayout
+from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.maths.statistics import RunningMoments
 
-CLIP = 10.0
+EDGE = 10.0  # deviations from the mean
+CLIP = 10.0  # of scaled rewards
+JITTER = 1e-12  # a smaller deviation is rounding of a task's own sums
 
 
 class ObservationNormaliser:
-    """(x - mean) / sqrt(variance + 1e-8), clipped to +-10, on the columns that are Box observations.
+    """z = (x - mean) / deviation on the columns that are Box observations, in float64.
 
-    ``mean`` and ``inverse_std`` [D] float32 are what a rollout uses; they change only in ``update``.
+    Beyond +-EDGE z grows as a logarithm only, sign(z) (EDGE + log(1 + |z| - EDGE)): an outlier stays bounded,
+    and of two numbers the larger stays the larger. A column that has been constant so far is divided by the
+    size of its constant (or 1). Moments are those of x - ``origin`` [D], the first row: the sums of large
+    numbers that differ little would round their differences away. ``mean`` and ``inverse_std`` [D] are what a
+    rollout uses; they change only in ``update``. ``old``, for runs up to 2026-11-22: float32,
+    sqrt(variance + 1e-8), and a clip at +-EDGE.
     """
 
-    def __init__(self, continuous: Array) -> None:
-        self.continuous = continuous
-        self.moments = RunningMoments.empty(len(continuous))
+    def __init__(self, continuous: Array, old: bool = False) -> None:
+        self.continuous, self.old = continuous, old
+        self.moments, self.origin = RunningMoments.empty(len(continuous)), np.zeros(len(continuous))
         self._freeze()
 
+    @property
+    def ready(self) -> bool:
+        """Whether there are statistics; before, numbers are taken as they are."""
+        return float(self.moments.count) > 1
+
     def _freeze(self) -> None:
-        mean, std = self.moments.mean.numpy(), np.sqrt(self.moments.variance.numpy() + 1e-8)
-        seen = float(self.moments.count) > 1
-        self.mean = np.where(self.continuous & seen, mean, 0.0).astype(np.float32)
-        self.inverse_std = np.where(self.continuous & seen, 1.0 / std, 1.0).astype(np.float32)
+        mean, std = self.origin + self.moments.mean.numpy(), np.sqrt(self.moments.variance.numpy())
+        size = np.abs(mean)
+        scale = np.where(std > JITTER, std, np.where(size > JITTER, size, 1.0))
+        if self.old:
+            scale = np.sqrt(self.moments.variance.numpy() + 1e-8)
+        seen = self.continuous & self.ready
+        self.mean, self.inverse_std = np.where(seen, mean, 0.0), np.where(seen, 1.0 / scale, 1.0)
 
     def __call__(self, flat: Array) -> Array:
-        """Normalised copy of [..., D] float32."""
-        return np.clip((flat - self.mean) * self.inverse_std, -CLIP, CLIP)
+        """Normalised copy of [..., D], float32."""
+        kind: Any = np.float32 if self.old else np.float64
+        flat, mean, inverse_std = (x.astype(kind, copy=False) for x in (flat, self.mean, self.inverse_std))
+        z = (flat - mean) * inverse_std
+        far = np.abs(z) - EDGE
+        if (far > 0).any():
+            beyond = 0.0 if self.old else np.log1p(np.maximum(far, 0.0))
+            z = np.where(far > 0, np.sign(z) * (EDGE + beyond), z)
+        return z.astype(np.float32)
 
     def update(self, flat: Array) -> None:
-        """Add the raw observations [N, D] of a rollout that has been learned from."""
-        self.moments = self.moments.update(torch.from_numpy(flat))
+        """Add the raw observations [N, D] of a rollout, which has been learned from or is the warm-up."""
+        if float(self.moments.count) == 0 and len(flat) and not self.old:
+            self.origin = flat[0].astype(np.float64)
+        self.moments = self.moments.update(torch.from_numpy(flat - self.origin))
         self._freeze()
 
     def state(self) -> dict[str, torch.Tensor]:
         """Tensors to save."""
-        return dict(vars(self.moments))
+        return {**vars(self.moments), "origin": torch.from_numpy(self.origin)}
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
         """Load saved tensors."""
         self.moments = RunningMoments(state["count"], state["mean"], state["variance"])
+        self.origin = state["origin"].numpy().copy()
         self._freeze()
 
 
@@ -100,11 +127,26 @@ class Normalisers:
     def __init__(self, observations: ObservationNormaliser | None, rewards: RewardNormaliser | None) -> None:
         self.observations, self.rewards = observations, rewards
 
+    @classmethod
+    def of(cls, layout: ObservationLayout, num_envs: int, settings: TrainSettings) -> Normalisers:
+        """Those that a run's settings ask for."""
+        seen = settings.normalise_observations and bool(layout.size)
+        observations = ObservationNormaliser(layout.continuous, settings.encoder == "old") if seen else None
+        scaled = settings.normalise_rewards
+        return cls(observations, RewardNormaliser(num_envs, settings.update.gamma) if scaled else None)
+
+    @property
+    def ready(self) -> bool:
+        """Whether a rollout may be learned from: observations have statistics, where they are normalised."""
+        return self.observations is None or self.observations.ready
+
     def encode(self, inputs: Inputs) -> Inputs:
         """Raw inputs as the networks see them."""
-        if self.observations is None or "flat" not in inputs:
+        if "flat" not in inputs:
             return inputs
-        return {**inputs, "flat": self.observations(inputs["flat"])}
+        flat = inputs["flat"]
+        seen = flat.astype(np.float32) if self.observations is None else self.observations(flat)
+        return {**inputs, "flat": seen}
 
     def scaled_rewards(self, rollout: Any) -> Array:
         """The rewards of a rollout to learn from, float32. The first rollout of all is scaled by its own
@@ -139,6 +181,8 @@ class Normalisers:
             if part is not None:
                 prefix = f"{kind}."
                 found = {k.removeprefix(prefix): x for k, x in state.items() if k.startswith(prefix)}
+                if kind == "observations":
+                    found.setdefault("origin", torch.zeros_like(found["mean"]))  # missing in old runs
                 for name, own in part.state().items():
                     low = 0.0 if name in ("count", "variance") else -math.inf
                     require_restorable(f"{prefix}{name}", found[name], own, at_least=low)

@@ -15,7 +15,9 @@ from torch import Tensor, nn
 from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.control.policy.distributions import Distribution
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces import ActionLayout, Inputs, ObservationLayout
+from tightrope.control.spaces.actions import ActionLayout
+from tightrope.control.spaces.observations import ObservationLayout, channels_last
+from tightrope.control.spaces.structure import Inputs
 
 InputTensors = dict[str, Tensor]
 ACTIVATION_LAYERS: dict[str, type[nn.Module]] = {
@@ -50,16 +52,26 @@ def _orthogonal(layer: Any, gain: float | None, generator: torch.Generator) -> A
 
 
 class ImageEncoder(nn.Module):
-    """Images [N, *shape] of bytes to features [N, 512]: the convolutions of Mnih et al. 2015, smaller for
-    small images.
+    """Images [N, *shape] to features [N, 512]: convolutions as in Mnih et al. 2015, smaller for small ones.
 
-    Channels may come first or last (the shorter of the two axes) or be missing; bytes are divided by 255.
+    Channels may come first or last (the shorter of the two axes) or be missing. Each number is first moved
+    from its bounds to [0, 1]: (x - low) / (high - low), bytes of 0..255 divided by 255 (``old``: always).
     """
 
-    def __init__(self, shape: tuple[int, ...], generator: torch.Generator) -> None:
+    low: Tensor | None
+    width: Tensor
+
+    def __init__(self, space: Box, generator: torch.Generator, old: bool = False) -> None:
         super().__init__()
+        shape = space.shape
         self.rank = len(shape)
-        self.channels_last = self.rank == 3 and shape[2] <= shape[0]
+        self.channels_last = channels_last(shape)
+        low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+        bounds = [np.zeros(()), np.full((), 255.0)] if old else [low, np.where(high > low, high - low, 1.0)]
+        for name, values in zip(("low", "width"), bounds, strict=True):  # not saved: they are the space's
+            one = values.flat[0]  # where all elements have the same bounds, one number broadcasts faster
+            buffer = torch.as_tensor(one if (values == one).all() else values, dtype=torch.float32)
+            self.register_buffer(name, buffer if buffer.any() else None, persistent=False)
         channels, *sides = {
             True: (shape[-1], *shape[:-1]),
             False: shape if self.rank == 3 else (1, *shape),
@@ -77,7 +89,7 @@ class ImageEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """[N, *shape] to [N, 512]."""
-        x = images.float() / 255.0
+        x = (images.float() if self.low is None else images.float() - self.low) / self.width
         x = x[:, None] if self.rank == 2 else x.permute(0, 3, 1, 2) if self.channels_last else x
         return self.layers(x)
 
@@ -102,8 +114,9 @@ class Policy(nn.Module):
         generator = torch.Generator().manual_seed(settings.seed)
         dimensions = int(actions.gaussian.sum())
         self.own = _own_module(own, observations, actions)
-        self.encoders = nn.ModuleList(ImageEncoder(s, generator) for s in observations.image_shapes)
-        size = observations.size + 512 * len(observations.image_shapes)
+        boxes = [leaf.space for leaf in observations.images if isinstance(leaf.space, Box)]
+        self.encoders = nn.ModuleList(ImageEncoder(x, generator, settings.encoder == "old") for x in boxes)
+        size = observations.size + 512 * len(observations.images)
         outputs = actions.num_parameters + (dimensions if settings.std == "state" else 0)
         hidden, activation = list(settings.hidden), settings.activation
         self.trunk: nn.Sequential | None = None
@@ -127,7 +140,9 @@ class Policy(nn.Module):
         self.gsde = bool(dimensions) and settings.std == "gsde"
         self.half_range: Tensor | None
         self.register_buffer(
-            "half_range", _half_range(actions) if settings.squash else None, persistent=False
+            "half_range",
+            _half_range(actions) if settings.action_bounds == "squash" else None,
+            persistent=False,
         )
         self.exploration: Tensor | None = None
 
@@ -277,7 +292,9 @@ def _own_module(
 
 
 def _half_range(actions: ActionLayout) -> Tensor | None:
-    """Half the width of the bounds of every Gaussian dimension [d]; ValueError where a bound is infinite."""
-    actions.check_squash()
-    widths = [(leaf.high - leaf.low) / 2.0 for leaf in actions.leaves if isinstance(leaf.space, Box)]
+    """Half the width of the bounds of every Gaussian dimension [d]; 1 for a constant one, whose density would
+    be infinite.
+    """
+    boxes = [leaf for leaf in actions.leaves if isinstance(leaf.space, Box)]
+    widths = [np.where(leaf.high > leaf.low, (leaf.high - leaf.low) / 2.0, 1.0) for leaf in boxes]
     return torch.as_tensor(np.concatenate(widths), dtype=torch.float32) if widths else None

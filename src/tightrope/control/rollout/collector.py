@@ -20,7 +20,7 @@ from tightrope.control.environments.faults import (
 )
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.rollout.rollout import Rollout
-from tightrope.control.spaces import Array, Inputs
+from tightrope.control.spaces.structure import Array, Inputs, float_parts
 from tightrope.errors import TightropeError
 
 
@@ -104,11 +104,27 @@ class Collector:
             )
         return noise
 
-    def collect(self, engine: Engine, num_steps: int) -> Rollout:
+    def collect(self, engine: Engine, num_steps: int, warm_up: int = 0) -> Rollout:
         """Step all environments ``num_steps`` times with the engine's policy.
 
-        The next call reuses the arrays of the rollout that it returns.
+        ``warm_up``: so many steps go before, for the first statistics of observations; the rollout counts
+        them and their episodes, and does not hold them. The next call reuses the arrays of the rollout that
+        it returns.
         """
+        if not warm_up:
+            return self._collect(engine, num_steps)
+        before = self._collect(engine, warm_up)
+        assert self.normalisers.observations is not None
+        self.normalisers.observations.update(before.raw[before.mask])
+        rollout = self._collect(engine, num_steps)
+        rollout.warm_up = before.steps
+        rollout.episodes = before.episodes + rollout.episodes
+        rollout.env_seconds += before.env_seconds
+        if rollout.restarts is not None:
+            rollout.restarts += before.restarts or 0
+        return rollout
+
+    def _collect(self, engine: Engine, num_steps: int) -> Rollout:
         rollout = self._cleared(num_steps)
         try:
             inputs = self._fill(rollout, engine)
@@ -131,9 +147,7 @@ class Collector:
     def _cleared(self, num_steps: int) -> Rollout:
         rollout = self._rollout
         if rollout is None or rollout.logp.shape[1] != num_steps:
-            keep_raw = self.normalisers.observations is not None
-            has_masks = self._action_mask is not None
-            rollout = Rollout(self.environments, num_steps, keep_raw=keep_raw, has_masks=has_masks)
+            rollout = Rollout(self.environments, num_steps, has_masks=self._action_mask is not None)
             self._rollout = rollout
         rollout.clear()
         return rollout
@@ -148,7 +162,7 @@ class Collector:
         inputs, action_mask, env_seconds = self._inputs, self._action_mask, 0.0
         for t in range(num_steps):
             self._column = t
-            if normaliser is not None:
+            if "flat" in inputs:
                 rollout.raw[:, t] = inputs["flat"]
             for rows in environments.row_groups:
                 seen = {name: x[rows, t] for name, x in rollout.inputs.items()}
@@ -186,14 +200,16 @@ class Collector:
         """
         environments, first_step = self.environments, self._step_count
         rows = np.arange(len(rollout.logp))
+        floats = [x for name, x in rollout.inputs.items() if name != "flat" and x.dtype.kind == "f"]
+        seen = [rollout.raw, *(x.reshape(*x.shape[:2], -1) for x in floats)]
+        after = first_step + num_steps
         # what, numbers [N, t, k], their rows, the step of the first, the column of the action that led there
-        checks = [("observation", rollout.raw[:, :num_steps], rows, first_step, -1)]
-        checks.append(("reward", rollout.rewards[:, :num_steps, None], rows, first_step, 0))
-        if "flat" in last:
-            checks.append(("observation", last["flat"][:, None], rows, first_step + num_steps, num_steps - 1))
-        for t, final_rows, x in rollout.finals:
-            if "flat" in x:
-                checks.append(("final observation", x["flat"][:, None], final_rows, first_step + t + 1, t))
+        checks = [("observation", x[:, :num_steps], rows, first_step, -1) for x in seen]
+        checks += [("reward", rollout.rewards[:, :num_steps, None], rows, first_step, 0)]
+        checks += [("observation", x[:, None], rows, after, num_steps - 1) for x in float_parts(last)]
+        for t, final_rows, final in rollout.finals:
+            parts = float_parts(final)
+            checks += [("final observation", x[:, None], final_rows, first_step + t + 1, t) for x in parts]
         for what, numbers, which, first, column in checks:
             found = first_unusable(numbers)
             if found is None:
@@ -204,7 +220,7 @@ class Collector:
             action = None
             if column + t >= 0:
                 chosen = rollout.actions[row, column + t]
-                action = action_text(environments.action_layout.to_env_single(chosen, environments.squash))
+                action = action_text(environments.action_layout.to_env_single(chosen))
             raise BadNumbers(
                 f"Environment {row} of {environments.spec_id} returned {what} = {numbers[place, t, index]} "
                 f"at {where}{circumstances(environments.worker_of(row), environments.seed_of(row), action)}; "

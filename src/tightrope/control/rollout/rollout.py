@@ -9,8 +9,8 @@ from tightrope.algorithms.batch import Batch
 from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
 from tightrope.control.engine.base import Engine, Steps
 from tightrope.control.environments.base import Environments
-from tightrope.control.policy.normalise import Normalisers
-from tightrope.control.spaces import Array, Inputs
+from tightrope.control.policy.normalise import EDGE, Normalisers
+from tightrope.control.spaces.structure import Array, Inputs
 
 
 class Rollout:
@@ -25,20 +25,15 @@ class Rollout:
     observations) of truncated episodes whose next row already belongs to a new episode.
     """
 
-    def __init__(
-        self, environments: Environments, num_steps: int, *, keep_raw: bool, has_masks: bool
-    ) -> None:
+    def __init__(self, environments: Environments, num_steps: int, *, has_masks: bool) -> None:
         layout = environments.observation_layout
         actions = environments.action_layout
         shape = (environments.num_envs, num_steps)
-        self.inputs: Inputs = {}
-        if layout.size:
-            self.inputs["flat"] = np.zeros((*shape, layout.size), np.float32)
-        for i, image in enumerate(layout.image_shapes):
-            self.inputs[f"image{i}"] = np.zeros((*shape, *image), np.uint8)
-        self.raw = self.inputs.get("flat", np.zeros((*shape, 0)))
-        if keep_raw:
-            self.raw = np.zeros_like(self.inputs["flat"])
+        self.inputs: Inputs = {
+            name: np.zeros((*shape, *x.shape[1:]), np.float32 if name == "flat" else x.dtype)
+            for name, x in layout.allocate(0).items()
+        }
+        self.raw = np.zeros((*shape, layout.size), np.float64)
         if has_masks:
             self.inputs["action_mask"] = np.ones((*shape, actions.num_logits), bool)
         self.actions = np.zeros((*shape, actions.num_columns), np.float32)
@@ -53,13 +48,14 @@ class Rollout:
         self.episodes: list[tuple[float, int, bool]] = []
         self.successes: list[float] = []  # of the episodes that said whether they reached their goal
         self.reward_statistics_taken = False
+        self.warm_up = 0  # steps before it that are not learned from
         self.env_seconds = 0.0
         self.restarts: int | None = None  # of environments; None: the settings do not allow it
 
     @property
     def steps(self) -> int:
-        """How many transitions there are."""
-        return int(self.mask.sum())
+        """How many transitions there are, those of the warm-up included."""
+        return int(self.mask.sum()) + self.warm_up
 
     def clear(self) -> None:
         """Make the arrays ready to be filled again."""
@@ -68,6 +64,18 @@ class Rollout:
         self.finals = []
         self.successes = []
         self.reward_statistics_taken = False
+        self.warm_up = 0
+
+
+def scale_metrics(rollout: Rollout, environments: Environments, normalisers: Normalisers) -> dict[str, float]:
+    """The shares of a rollout's numbers that were cut off at a bound, or pressed together as outliers."""
+    clipped = environments.action_layout.clipped_share(rollout.actions[rollout.mask])
+    found = {} if clipped is None else {"rollout/action_clip_fraction": clipped}
+    if normalisers.observations is not None:
+        columns = normalisers.observations.continuous
+        far = np.abs(rollout.inputs["flat"][rollout.mask][:, columns]) >= EDGE
+        found["rollout/observation_outlier_fraction"] = float(far.mean()) if far.size else 0.0
+    return found
 
 
 def to_batch(rollout: Rollout, engine: Engine, normalisers: Normalisers, settings: UpdateSettings) -> Batch:

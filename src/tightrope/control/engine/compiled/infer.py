@@ -2,38 +2,51 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from tightrope.control.engine.compiled import plan
 from tightrope.control.engine.compiled.cache import entry
 from tightrope.control.engine.compiled.distributions import evaluate_actions, sample_actions
 from tightrope.control.engine.compiled.layers import forward
-from tightrope.control.engine.compiled.primitives import ZERO, f, row, runtime
+from tightrope.control.engine.compiled.primitives import ZERO, f, row, runtime, scalar
+
+
+@scalar
+def standard(x, mean, inverse, edge, hard):
+    """One number as ObservationNormaliser gives it."""
+    z = (x - mean) * inverse
+    beyond = abs(z) - edge
+    if beyond > 0:
+        size = edge if hard else edge + math.log1p(beyond)
+        return size if z > 0 else -size
+    return z
 
 
 @entry(
-    "void(int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1], float32[:,:], float32[::1],"
-    "float32[::1], float64, boolean[:,:], float32[:,:], float32[:,:], float32[:], float32[:,:])"
+    "void(int64[::1], int64[:,::1], int64[:,::1], float32[::1], float32[::1], float64[:,:], float64[::1],"
+    "float64[::1], float64, boolean, boolean[:,:], float32[:,:], float32[:,:], float32[:], float32[:,:])"
 )
 def act_batch(
-    places, layers, components, flat, work, raw, mean, inverse, clip, masks, noise, actions, logp, inputs
+    places, layers, components, flat, work,
+    raw, mean, inverse, edge, hard, masks, noise, actions, logp, inputs,
 ):  # fmt: skip
     """Normalise, run the actor, sample; write actions, log-probabilities and normalised inputs.
 
     Parameters in order: the tables of the plan; the buffers of parameters and of intermediate matrices; raw
-    observations [B, D]; mean and inverse [D] of the normaliser (empty: none) and its clip; action masks [B,
-    W] (no rows: none); noise [B, A]; outputs: actions [B, A], logp [B] and inputs [B, D].
+    observations [B, D]; mean and inverse [D] of the normaliser (empty: none), its edge, and whether it clips
+    there; action masks [B, W] (no rows: none); noise [B, A]; outputs: actions [B, A], logp [B] and inputs
+    [B, D].
     """
-    normalise, limit, masked = len(mean) > 0, f(clip), masks.shape[0] > 0
+    normalise, masked = len(mean) > 0, masks.shape[0] > 0
     for begin in range(0, len(raw), plan.BLOCK_ROWS):
         n = plan.BLOCK_ROWS if len(raw) - begin > plan.BLOCK_ROWS else len(raw) - begin
         for i in range(n):
             for d in range(places[plan.FEATURES]):
-                x = raw[begin + i, d]
+                x = f(raw[begin + i, d])
                 if normalise:
-                    x = (x - mean[d]) * inverse[d]
-                    x = -limit if x < -limit else x
-                    x = limit if x > limit else x
+                    x = f(standard(raw[begin + i, d], mean[d], inverse[d], edge, hard))
                 inputs[begin + i, d] = x
                 work[d * n + i] = x
             if masked:

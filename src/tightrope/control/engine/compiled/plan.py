@@ -59,14 +59,14 @@ def unsupported(policy: Any, settings: UpdateSettings, device: Any, algorithm: s
 def _uncovered_policy(policy: Any) -> str | None:
     if getattr(policy, "own", None) is not None or getattr(policy, "actor", None) is None:
         return "own modules"
-    if len(getattr(policy, "encoders", ())) or policy.observation_layout.image_shapes:
+    if len(getattr(policy, "encoders", ())) or policy.observation_layout.images:
         return "image observations"
     if getattr(policy, "gsde", False):
         return "gSDE"
     if getattr(policy, "std", "independent") == "state":
         return "a deviation that depends on the state"
     if getattr(policy, "half_range", None) is not None:
-        return "squash"
+        return "action_bounds squash"
     for name in ("trunk", "actor", "critic"):
         reason = _uncovered_network(getattr(policy, name), ends_linear=name != "trunk")
         if reason is not None:
