@@ -37,6 +37,7 @@ def tightrope_settings(scenario: dict[str, Any]) -> dict[str, Any]:
         "normalise_advantages": True,
         "normalise_observations": False,
         "normalise_rewards": False,
+        "normalise_values": False,
         "hidden": (64, 64),
         "activation": "tanh",
         "shared": False,

@@ -69,7 +69,7 @@ def advantages_by_step(make, settings, *, rollouts=2):
     env = make()
     agent = tightrope.PPO(
         env, policy=Scripted(), seed=BASE_SEED, gamma=GAMMA, gae_lambda=LAMBDA, num_steps=COLUMNS,
-        normalise_observations=False, normalise_rewards=False, **{"num_envs": 2, **settings},
+        normalise_observations=False, normalise_values=False, **{"num_envs": 2, **settings},
     )  # fmt: skip
     agent.collector.reset(BASE_SEED)
     found = {}
@@ -102,16 +102,16 @@ def whole_episodes(found):
 
 
 def expected_advantages(row, episode, steps):
-    """GAE by its definition, backwards in float32, only from the script."""
+    """GAE by its definition, backwards in float64, only from the script."""
     numbers = [torch.tensor([[row, episode, k]], dtype=torch.float32) for k in range(len(steps) + 1)]
-    values = torch.stack([value(x)[0] for x in numbers])
-    trace, result = torch.zeros(()), []
+    values = torch.stack([value(x)[0] for x in numbers]).double()
+    trace, result = torch.zeros((), dtype=torch.float64), []
     for k in reversed(range(len(steps))):
         reward, terminated, _, _ = steps[k]
         future = torch.zeros(()) if terminated else values[k + 1]
-        delta = torch.tensor(reward, dtype=torch.float32) + GAMMA * future - values[k]
+        delta = reward + GAMMA * future - values[k]
         trace = delta + GAMMA * LAMBDA * trace
-        result.append(float(trace))
+        result.append(float(trace.float()))
     return result[::-1]
 
 

@@ -2,12 +2,14 @@
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 
-from tightrope.control.policy.distributions import Distribution
+import tightrope
+from tightrope.control.policy.distributions import Distribution, bounded
 from tightrope.control.policy.policy import Policy
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces.actions import action_layout
@@ -124,3 +126,36 @@ def test_entropies_are_those_of_the_maths_to_the_bit():
         wanted = divergence.categorical_entropy(logits[:, :5]) + divergence.bernoulli_entropy(logits[:, 5:])
         wanted = wanted + divergence.gaussian_entropy(log_std.expand(6, 4))
         assert torch.equal(Distribution(layout, parameters, log_std, mask).entropy(), wanted)
+
+
+@pytest.mark.parametrize("engine", ["torch", "auto"])
+@pytest.mark.parametrize("std", ["independent", "state", "gsde"])
+@pytest.mark.parametrize("start", [2.5, 3.0])
+def test_a_deviation_above_its_range_comes_back(engine, std, start):
+    """Every step away from 0 costs, so that a smaller deviation pays."""
+
+    class Still(gym.Env):
+        observation_space = spaces.Box(-1, 1, (1,), np.float32)
+        action_space = spaces.Box(-100, 100, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return np.ones(1, np.float32), {}
+
+        def step(self, action):
+            return np.ones(1, np.float32), -float(abs(action[0])), True, False, {}
+
+    agent = tightrope.PPO(
+        lambda: Still(), std=std, log_std_init=start, engine=engine, seed=0, num_envs=8, num_steps=32,
+        learning_rate=3e-2, learning_rate_schedule="constant", notify=lambda text: None,
+    ).learn(8_192)  # fmt: skip
+    distribution, _ = agent.policy.evaluate({"flat": torch.ones(1, 1)})
+    assert float(distribution.log_std.detach().mean()) < 1.5
+
+
+def test_within_its_range_a_deviation_is_the_plain_clamp_and_outside_only_the_way_out_is_cut():
+    x = torch.tensor([-25.0, -25.0, -20.0, 0.3, 2.0, 2.5, 2.5], requires_grad=True)
+    y = bounded(x)
+    assert torch.equal(y, x.clamp(-20, 2))
+    y.backward(torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0]))
+    assert x.grad.tolist() == [0, -1, 1, 1, -1, 1, 0]

@@ -10,7 +10,7 @@ from torch import nn
 
 import tightrope
 from tightrope.control.policy.normalise import ObservationNormaliser, RewardNormaliser
-from tightrope.control.rollout.rollout import critic_values, scale_metrics
+from tightrope.control.rollout.rollout import critic_values, cut_shares
 
 
 def test_reward_scale_by_hand_and_restarts_at_both_kinds_of_end():
@@ -147,7 +147,7 @@ def test_an_outlier_is_counted():
     agent.collector.reset(0)
     agent.normalisers.observations.update(np.random.default_rng(0).standard_normal((99, 3)))
     rollout = agent.collector.collect(agent.engine, 16)
-    found = scale_metrics(rollout, agent.environments, agent.normalisers)
+    found = cut_shares(rollout, agent.environments, agent.normalisers)
     assert found == {"rollout/observation_outlier_fraction": 1.0}
 
 

@@ -11,7 +11,7 @@ from language.tiny import saved, tiny_llama
 from tightrope.algorithms import ppo
 from tightrope.algorithms.micro_batches import OutOfMemory
 from tightrope.language.alignment.align import align
-from tightrope.language.alignment.experience import gather
+from tightrope.language.alignment.experience import batch_of, gather, to_scale
 from tightrope.language.alignment.iteration import Trainer, hold_out_prompts
 from tightrope.language.alignment.kl import adapted
 from tightrope.language.alignment.ptx import Pretraining
@@ -119,6 +119,51 @@ def test_the_pass_that_the_rollout_keeps_changes_no_metric(folder, monkeypatch):
     assert taken == [False, True, True, False, False, False]  # never while only the critic warms up
     for kept, own in zip(*found, strict=True):
         assert kept == pytest.approx(own, rel=1e-2, abs=1e-3)
+
+
+@pytest.mark.parametrize("tune, critic", [("lora", "head"), ("lora", "adapter"), ("full", "separate")])
+def test_a_kept_pass_moves_with_the_scale_of_returns_and_so_do_its_gradients(folder, tune, critic):
+    """Its graph was made with the head from before: values and gradients are those of a pass with the new."""
+    made = trainer(folder, minibatch_size=16, tune=tune, critic=critic, total_episodes=48)
+    next(made.iterate())
+    parameters = made.roles.parameters()
+    experience = gather(made.roles, made.prompts * 4, 5, 0, 1, keep=True)
+    valid, rewards = torch.ones(16, dtype=torch.bool), torch.full_like(experience.values, 40.0)
+    batch = batch_of(experience, rewards, valid, made.settings, made.return_scale)
+    before, found = made.return_scale, []
+    batch, made.return_scale = to_scale(batch, experience, before, made.roles.critic_head)
+    assert made.return_scale.deviation > 3 * before.deviation > 0
+    for first_pass in (experience.first_pass, None):
+        now = PolicyModel(made.roles, first_pass=first_pass)(batch)
+        values = torch.where(batch.mask, now.values, 0.0)
+        gradients = torch.autograd.grad(
+            (values - batch.returns).square()[batch.mask].sum(), parameters, allow_unused=True,
+            materialize_grads=True,
+        )  # fmt: skip
+        found.append([values, *gradients])
+        real = torch.where(batch.mask, made.return_scale.values(values) - before.values(experience.values), 0)
+        assert float(real.detach().abs().max()) < 1e-4
+    for kept, own in zip(*found, strict=True):
+        torch.testing.assert_close(kept, own, rtol=1e-3, atol=1e-4)
+
+
+def test_the_critic_learns_returns_of_any_size_alike(folder):
+    found = []
+    for scale in (1e-6, 1e6):
+        made = trainer(
+            folder, reward_scale=scale, kl_beta=0.0, total_episodes=320, critic_warmup=20, gae_lambda=1.0
+        )
+        shown = [update.metrics for update in made.iterate()]
+        explained = [row["train/explained_variance"] for row in shown]
+        found.append([*explained, shown[-1]["train/return_mean"] / scale, shown[-1]["train/value_loss"]])
+    assert np.mean(found[0][10:20]) > 0.1
+    assert found[0] == pytest.approx(found[1], rel=1e-2, abs=1e-3)
+
+
+def test_a_new_critic_counts_for_nothing_and_none_has_no_scale(folder):
+    assert trainer(folder).return_scale.deviation == 0
+    assert trainer(folder, normalise_values=False).return_scale is None
+    assert trainer(folder, critic="none", samples_per_prompt=2).return_scale is None
 
 
 @pytest.mark.parametrize("micro", [1, 3, 5])
@@ -242,7 +287,8 @@ def test_a_critic_made_of_the_reward_model_begins_with_its_scores(folder, tmp_pa
     made = trainer(folder, (reward, -0.5), critic=critic, **shaped)
     experience = gather(made.roles, made.prompts, 1, 0, 1)
     scores = made.judge(made.prompts, experience)
-    np.testing.assert_allclose(experience.final_values.numpy(), 3.0 * scores.total, rtol=1e-3, atol=1e-3)
+    values = made.return_scale.values(experience.final_values)
+    np.testing.assert_allclose(values.numpy(), 3.0 * scores.total, rtol=1e-3, atol=1e-3)
     assert scores.total.std() > 0.01
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tightrope.maths.values import clipped_squared_error, explained_variance, squared_error
+from tightrope.maths.values import ReturnScale, clipped_squared_error, explained_variance, squared_error
 
 
 def row(*numbers: float) -> Tensor:
@@ -50,6 +50,73 @@ def test_explained_variance_of_equal_returns_is_0() -> None:
     assert explained_variance(torch.randn(8, 8), returns, mask) == 0
     assert explained_variance(returns, returns, mask) == 0
     assert explained_variance(returns, returns, ~mask) == 0
+
+
+def test_the_scale_of_returns_by_hand() -> None:
+    first = ReturnScale().update(row(1, 1, 3, 3), ALL)
+    assert (first.mean, first.deviation, first.weight) == pytest.approx((2, 1, 0.1))
+    # the share of the second rollout is 0.1 / 0.19; its mean is 4 and its variance 0
+    second, share = first.update(row(4, 4, 4, 4), ALL), 0.1 / 0.19
+    variance = (1 - share) + share * (1 - share) * 4
+    assert (second.mean, second.deviation) == pytest.approx((2 + 2 * share, variance**0.5))
+    # a rollout of a deviation of 100 counts at once
+    assert second.update(row(-100, 100, -100, 100), ALL).deviation == 100
+    assert first.values(row(-1, 0, 2, 9)).tolist() == [[1, 2, 4, 11]]
+    assert first.outputs(row(1, 2, 4, 11)).tolist() == [[-1, 0, 2, 9]]
+
+
+def test_the_scale_of_returns_leaves_out_masked_steps_and_waits_for_finite_ones() -> None:
+    mask = torch.tensor([[True, True, False, False]])
+    assert ReturnScale().update(row(1, 3, 9, torch.nan), mask) == ReturnScale(2.0, 1.0, 0.1)
+    before = ReturnScale(2.0, 1.0, 0.1)
+    assert before.update(row(1, 3, 9, torch.nan), ALL) == before
+    assert before.update(row(1, 3, 9, 9), ~ALL) == before
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-6, 1.0, 1e6, 1e30])
+@pytest.mark.parametrize("offset", [0.0, 1e6, -1e9])
+def test_targets_are_of_order_1_for_any_size_and_offset(size: float, offset: float) -> None:
+    plain = torch.randn(1, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    scale = ReturnScale().update(size * (offset + plain), ALL)
+    expected = (plain - plain.mean()) / plain.std(correction=0)
+    torch.testing.assert_close(scale.outputs(size * (offset + plain)), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_returns_that_are_alike_have_no_deviation_and_outputs_then_count_for_nothing() -> None:
+    scale = ReturnScale()
+    for _ in range(30):
+        scale = scale.update(row(0.1, 0.1, 0.1, 0.1), ALL)
+    assert scale.deviation == 0
+    assert scale.values(row(5, -5, 0, 1)).tolist() == [[scale.mean] * 4]
+    assert scale.outputs(row(0.1, 0.1, 0.1, 0.1)).abs().max() < 1e-12
+    # after a deviation has been seen it takes many rollouts, but not for ever
+    scale = scale.update(row(0, 1, 0, 1), ALL)
+    for _ in range(2000):
+        scale = scale.update(row(1, 1, 1, 1), ALL)
+    assert scale.mean == pytest.approx(1) and scale.deviation == 0
+
+
+@pytest.mark.parametrize("after", [ReturnScale(7.0, 3.0, 1.0), ReturnScale(-1e6, 1e5, 1.0)])
+def test_a_layer_that_is_carried_gives_the_same_values(after: ReturnScale) -> None:
+    before, generator = ReturnScale(2.0, 0.5, 0.5), torch.Generator().manual_seed(0)
+    features, weight = (torch.randn(5, 3, dtype=torch.float64, generator=generator) for _ in range(2))
+    bias = torch.randn(5, dtype=torch.float64, generator=generator)
+    old = before.values(features @ weight.T + bias)
+    factor, shift = before.change(after)
+    torch.testing.assert_close(after.values(features @ (factor * weight).T + factor * bias + shift), old)
+
+
+def test_outputs_that_counted_for_nothing_are_not_carried() -> None:
+    new, known = ReturnScale(), ReturnScale(2.0, 0.5, 0.1)
+    assert new.change(known) == known.change(new) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    "numbers", [(0.0, -1.0, 0.0), (torch.nan, 1.0, 0.0), (0.0, torch.inf, 0.0), (0, 1, 0)]
+)
+def test_statistics_that_cannot_be_are_refused(numbers: tuple[float, float, float]) -> None:
+    with pytest.raises(ValueError, match="expected finite floats"):
+        ReturnScale(*numbers)
 
 
 def test_gradients_agree_with_finite_differences() -> None:

@@ -1,4 +1,7 @@
-"""The data one update works on: rows are environments or prompts, columns are steps or tokens."""
+"""The data one update works on: rows are environments or prompts, columns are steps or tokens.
+
+Before the update the scale of returns moves to it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from tightrope.maths.values import ReturnScale
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Batch:
 
     ``inputs`` is opaque: a dict of tensors whose leading axis is the row (control: [B, T, ...] observations).
     ``actions`` is [B, T, ...]; ``old_logp`` is the log-probability at sampling; ``returns`` = advantages +
-    old values.
+    old values. The three are in units of the return, or as `in_scale` gives them.
     """
 
     inputs: dict[str, Tensor]
@@ -51,6 +56,17 @@ class Batch:
     def select(self, rows: Tensor | slice) -> Batch:
         """The batch of these rows only (an index tensor or a slice)."""
         return self.map(lambda x: x[rows])
+
+    def in_scale(self, scale: ReturnScale | None, *, advantages: bool) -> Batch:
+        """The batch as the critic learns it, float32: old values and returns in its scale (None: in units of
+        the return). ``advantages``: these too, where only their order and their proportions count.
+        """
+        names = ("old_values", "returns", "advantages")
+        numbers: dict[str, Any] = {name: getattr(self, name) for name in names}
+        if scale is not None:
+            numbers |= {name: scale.outputs(numbers[name]) for name in names[:2]}
+            numbers["advantages"] = self.advantages / (scale.unit if advantages else 1.0)
+        return dataclasses.replace(self, **{name: x.float() for name, x in numbers.items()})
 
     def as_steps(self) -> Batch:
         """[B, T] to [N, 1]: every counting step becomes a row; masked steps are left out."""
@@ -92,3 +108,25 @@ class Batch:
             return
         for start in range(0, len(self), size):
             yield self.select(slice(start, start + size))
+
+
+def move_scale(scale: ReturnScale, batch: Batch, layer: nn.Linear | None) -> ReturnScale:
+    """The scale after a rollout, whose ``batch`` is in units of the return. ``layer``, the critic's last one,
+    is carried into it; None: outputs have to follow by learning.
+
+    Adam's moments stay: gradients are of order 1 in either scale.
+    """
+    now = scale.update(batch.returns, batch.mask)
+    if layer is not None:
+        # .data: a pass that kept its graph still finds this layer, and its gradients are those of the new one
+        factor, shift = scale.change(now)
+        layer.weight.data.mul_(factor)
+        layer.bias.data.mul_(factor).add_(shift)
+    return now
+
+
+def scale_metrics(scale: ReturnScale | None) -> dict[str, float]:
+    """The metrics that show a scale; none without one."""
+    if scale is None:
+        return {}
+    return {"train/return_mean": scale.mean, "train/return_deviation": scale.deviation}

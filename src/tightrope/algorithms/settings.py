@@ -44,6 +44,11 @@ class UpdateSettings(Settings):
         0.5, "One joint limit on the norm of all gradients; none: gradients are not clipped.", above=0
     )
     normalise_advantages: bool = setting(True, "Advantages to mean 0 and deviation 1 within each minibatch.")
+    normalise_values: bool = setting(
+        True,
+        "The critic learns returns at mean 0 and deviation 1; values stay in units of the return.",
+        before=False,
+    )
     micro_batch_size: int | None = setting(
         None,
         "Rows per forward pass; splits a minibatch to save memory, the gradient stays the same.",
@@ -92,7 +97,7 @@ class PPOSettings(UpdateSettings):
     )
     value_clip: float | None = setting(
         None,
-        "Also keep value updates within +- this (returns' units after reward scaling); none: off.",
+        "Also keep value updates within +- this (deviations with normalise_values); none: off.",
         above=0,
     )
     target_kl: float | None = setting(

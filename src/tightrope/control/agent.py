@@ -36,9 +36,8 @@ from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import require_room, resolve
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.episodes import FinishedEpisodes
-from tightrope.control.rollout.rollout import scale_metrics, to_batch
+from tightrope.control.rollout.rollout import cut_shares, to_batch
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces.observations import ObservationLayout
 from tightrope.control.spaces.structure import Array, Inputs, Reading, structure
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint, signals
@@ -181,12 +180,19 @@ class Agent:
 
     def _learned(self) -> Tensors:
         """What an update changes in place."""
-        return {"policy": dict(self.policy.state_dict()), "optimiser": optimiser_tensors(self.optimiser)}
+        found = {"policy": dict(self.policy.state_dict()), "optimiser": optimiser_tensors(self.optimiser)}
+        normalisers = self.normalisers.state()
+        return {**found, "normalisers": normalisers} if normalisers else found
 
     def _unlearn(self, tensors: Tensors) -> None:
         """Put back what `_learned` gave."""
         self.policy.load_state_dict(tensors["policy"])
         restore_optimiser(self.optimiser, tensors["optimiser"])
+        normalisers = dict(tensors.get("normalisers", {}))
+        running = normalisers.get("rewards.running")
+        if running is not None and len(running) != self.environments.num_envs:
+            normalisers["rewards.running"] = torch.zeros(self.environments.num_envs, dtype=torch.float64)
+        self.normalisers.load(normalisers)
 
     def _next_columns(self, budget: int, start: int) -> tuple[int, int]:
         """Columns of the warm-up, at most a tenth of what is left, and of the rollout behind it: whole
@@ -215,10 +221,10 @@ class Agent:
                 self.collector.reset(self.settings.seed, self.steps)
             rollout = self.collector.collect(self.engine, columns, warm_up)
         collected = time.perf_counter()
-        batch = to_batch(rollout, self.engine, self.normalisers, present)
-        metrics = scale_metrics(rollout, self.environments, self.normalisers)
-        if bool(batch.mask.any()):
-            with whole_update(self._update_seconds, self._learned, self._unlearn):
+        with whole_update(self._update_seconds, self._learned, self._unlearn):
+            batch = to_batch(rollout, self.engine, self.normalisers, present, True)
+            metrics = self.normalisers.metrics() | cut_shares(rollout, self.environments, self.normalisers)
+            if bool(batch.mask.any()):
                 metrics |= self.engine.update(
                     batch,
                     present,
@@ -226,9 +232,9 @@ class Agent:
                     refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
                     log_ratio_limit=self._log_ratio_limit(batch),
                 )
-            metrics["train/explained_variance"] = float(
-                explained_variance(batch.old_values, batch.returns, batch.mask)
-            )
+                metrics["train/explained_variance"] = float(
+                    explained_variance(batch.old_values, batch.returns, batch.mask)
+                )
         kl = metrics.get("train/kl_after")
         if isinstance(present, PPOSettings) and present.kl_beta and present.kl_adapt and kl is not None:
             self.kl_beta = ppo.next_kl_beta(present.kl_beta, kl, present.kl_adapt)
@@ -265,7 +271,7 @@ class Agent:
         ``deterministic``: the most likely action, else a sampled one.
         """
         layout, actions = self.environments.observation_layout, self.environments.action_layout
-        batched = _is_batched(layout, observation)
+        batched = layout.is_batched(observation)
         inputs = layout.encode(observation, batched=batched)
         masks = layout.mask_of(observation) if action_masks is None else action_masks
         action_mask = flat_mask(masks, len(next(iter(inputs.values()))), actions)
@@ -275,12 +281,14 @@ class Agent:
     def value(self, observation: Any) -> Any:
         """The critic's V(s) in units of the return: a float for one observation, an array [N] for a batch."""
         layout = self.environments.observation_layout
-        batched = _is_batched(layout, observation)
+        batched = layout.is_batched(observation)
         inputs = self.normalisers.encode(require_finite(layout.encode(observation, batched=batched)))
-        values = self.policy.values(inputs).cpu().numpy()
+        values = self.policy.values(inputs).cpu()
+        if self.normalisers.returns is not None:
+            values = self.normalisers.returns.values(values)
         if self.normalisers.rewards is not None:
             values = values * self.normalisers.rewards.deviation
-        return values if batched else float(values[0])
+        return values.numpy() if batched else float(values[0])
 
     def choose(
         self, inputs: Inputs, action_mask: Array | None, rng: np.random.Generator | None = None
@@ -330,9 +338,6 @@ class Agent:
     def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
         """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
         tensors = self._learned()
-        normalisers = self.normalisers.state()
-        if normalisers:
-            tensors["normalisers"] = normalisers
         state = {
             "settings": self.settings.to_json(),
             "steps": self.steps,
@@ -372,11 +377,6 @@ class Agent:
         for name, parameter in self.policy.named_parameters():
             require_restorable(name, tensors["policy"][name], parameter)
         self._unlearn(tensors)
-        normalisers = dict(tensors.get("normalisers", {}))
-        running = normalisers.get("rewards.running")
-        if running is not None and len(running) != self.environments.num_envs:
-            normalisers["rewards.running"] = torch.zeros(self.environments.num_envs, dtype=torch.float64)
-        self.normalisers.load(normalisers)
         beta = state["kl_beta"]
         self.steps = checkpoint.counted(state["steps"])
         self.kl_beta = None if beta is None else float(beta)
@@ -475,23 +475,13 @@ def _environments(env: Any, settings: TrainSettings) -> Environments:
     source = settings.env if env is None else env
     backend, workers, policy = settings.vector_backend, settings.num_workers, policy_of(settings)
     return make_environments(
-        source, settings.num_envs, backend=backend, num_workers=workers, policy=policy,
+        source,
+        settings.num_envs,
+        backend=backend,
+        num_workers=workers,
+        policy=policy,
         reading=Reading.of(settings),
-    )  # fmt: skip
-
-
-def _is_batched(layout: ObservationLayout, observation: Any) -> bool:
-    """Whether an observation has one axis more than its space."""
-    leaf, part = layout.leaves[0], observation
-    try:
-        for key in leaf.path:
-            part = part[key]
-        return np.ndim(part) > len(leaf.space.shape or ())
-    except (LookupError, TypeError, ValueError) as error:  # no such key, no dict, rows of several lengths
-        raise ValueError(
-            f"The observation is {repr(observation)[:80]}; expected one of {layout.space}, or a batch of "
-            "them."
-        ) from error
+    )
 
 
 def _settings_metrics(present: UpdateSettings) -> dict[str, float]:

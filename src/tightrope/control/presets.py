@@ -91,7 +91,7 @@ REINFORCE_PRESETS: dict[str, dict[str, Any]] = {
 }
 
 BY_TASK = {"ppo": PPO_PRESETS, "a2c": A2C_PRESETS, "reinforce": REINFORCE_PRESETS}
-A2C_DEFAULT = {"num_steps": 16, "learning_rate": 7e-4, "normalise_rewards": True}
+A2C_DEFAULT = {"num_steps": 16, "learning_rate": 7e-4}
 
 
 KINDS = ("discrete", "continuous", "images")
@@ -125,11 +125,10 @@ def preset(
             "hidden": (),
             "shared": True,
             "normalise_observations": True,  # what lies beside the images
-            "normalise_rewards": True,
         }
         values |= {"num_epochs": 4, "minibatch_size": 256, "clip": 0.1} if algorithm == "ppo" else {}
         return values
-    values |= {"normalise_observations": True, "normalise_rewards": True}
+    values["normalise_observations"] = True
     if kind == "continuous":
         values["log_std_init"] = -0.5
     if algorithm == "a2c":

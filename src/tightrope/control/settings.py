@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from tightrope.algorithms.settings import A2CSettings, PPOSettings, ReinforceSettings, UpdateSettings
 from tightrope.settings.fields import of_update_rule, setting
 from tightrope.settings.values import Settings
 
-BEFORE = {"action_bounds": "clip", "encoder": "old"}  # what runs did that have no such settings
 EVALUATION_SEED = 1_000_003  # far from training's seeds, which start at settings.seed
 Algorithm = Literal["ppo", "a2c", "reinforce"]
 ALGORITHM_SETTINGS: dict[str, type[UpdateSettings]] = {
@@ -44,7 +43,9 @@ class TrainSettings(Settings):
         "Box actions' deviation: one number a dimension, a function of the state, or gSDE noise.",
         choices=("independent", "state", "gsde"),
     )
-    log_std_init: float = setting(0.0, "Log of the first deviation of Box actions.", at_least=-10, at_most=3)
+    log_std_init: float = setting(
+        0.0, "Log of the first deviation of Box actions; above 2 it acts as 2.", at_least=-10, at_most=3
+    )
     gsde_steps: int = setting(
         8, "With gSDE: steps for which one exploration matrix is held.", at_least=1, needs={"std": ("gsde",)}
     )
@@ -52,11 +53,13 @@ class TrainSettings(Settings):
         "map",
         "How Box actions reach their bounds: [-1, 1] stretched onto them, clipped to them, or by tanh.",
         choices=("map", "clip", "squash"),
+        before="clip",
     )
     encoder: str = setting(
         "auto",
         "Convolutions for what looks like an image, for every Box that can be one, or for none.",
         choices=("auto", "cnn", "mlp", "old"),
+        before="old",
     )
 
     normalise_observations: bool = setting(
@@ -158,16 +161,11 @@ class TrainSettings(Settings):
             )
 
     @classmethod
-    def from_json(cls, data: Any, source: object = "settings.json") -> Self:
-        """See Settings. A setting that a run did not know yet has the value that says what it did."""
-        return super().from_json({**BEFORE, **data} if isinstance(data, dict) else data, source)
-
-    @classmethod
     def values_from_json(cls, data: Any, source: object = "settings.json") -> dict[str, Any]:
         """See Settings. ``squash``, the setting before ``action_bounds``, is translated."""
         if isinstance(data, dict) and isinstance(data.get("squash"), bool):
             kept = {name: value for name, value in data.items() if name != "squash"}
-            data = {**BEFORE, **kept, "action_bounds": "squash" if data["squash"] else "clip"}
+            data = {"encoder": "old", **kept, "action_bounds": "squash" if data["squash"] else "clip"}
         return super().values_from_json(data, source)
 
     def risks(self) -> list[str]:

@@ -299,6 +299,7 @@ class Recipe(NamedTuple):
 RECIPES: dict[str, Recipe] = {
     "ziegler2019": Recipe(
         {
+            "normalise_values": False,
             "kl_beta": 0.15, "kl_goal": 6.0, "kl_horizon": 10_000.0, "temperature": 0.7, "num_epochs": 4,
             "value_clip": 0.2, "value_weight": 0.1, "whiten_rewards": True, "critic": "head",
             "max_new_tokens": 24, "tune": "full",
@@ -309,6 +310,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "instructgpt": Recipe(
         {
+            "normalise_values": False,
             "kl_beta": 0.02, "temperature": 1.0, "num_epochs": 1, "batch_size": 512, "minibatch_size": 64,
             "critic": "separate", "critic_from_reward": True, "tune": "full", "learning_rate": 8e-6,
             "critic_learning_rate": 9e-6, "learning_rate_schedule": "constant", "ptx_weight": 27.8,
@@ -319,6 +321,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "nplus": Recipe(
         {
+            "normalise_values": False,
             "kl_beta": 0.05, "temperature": 0.7, "num_epochs": 4, "batch_size": 512, "minibatch_size": 512,
             "value_clip": 0.2, "value_weight": 0.1, "critic": "separate", "critic_from_reward": True,
             "tune": "full", "learning_rate": 3e-6, "missing_eos_penalty": 1.0, "max_new_tokens": 53,
@@ -327,6 +330,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "ppo-max": Recipe(
         {
+            "normalise_values": False,
             "kl_beta": 0.05, "batch_size": 128, "minibatch_size": 32, "num_epochs": 1, "value_clip": 0.2,
             "critic": "separate", "critic_from_reward": True, "tune": "full", "learning_rate": 5e-7,
             "critic_learning_rate": 1.65e-6, "reward_clip": 10.0, "critic_warmup": 10,
@@ -336,6 +340,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "vapo": Recipe(
         {
+            "normalise_values": False,
             "kl_beta": 0.0, "clip": 0.2, "clip_high": 0.28, "critic_lambda": 1.0, "lambda_alpha": 0.05,
             "critic": "separate", "critic_from_reward": True, "critic_warmup": 50, "tune": "full",
             "learning_rate": 1e-6, "critic_learning_rate": 2e-6, "samples_per_prompt": 16,

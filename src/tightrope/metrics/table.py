@@ -129,10 +129,31 @@ _TABLE = (
     ),
     metric(
         "train/value_loss",
-        "return^2",
+        "deviations^2",
         "down",
-        "Half the critic's mean squared error, with value_clip the clipped one; rises with the returns as a "
-        "policy learns.",
+        "Half the critic's mean squared error, with value_clip the clipped one, in squared deviations of the "
+        "return (train/return_deviation); without normalise_values in squared units of the return.",
+    ),
+    metric(
+        "train/return_mean",
+        "return",
+        "any",
+        "With normalise_values: the mean of the returns of about the last ten rollouts, which the critic's "
+        "targets are centred on.",
+        negative=True,
+    ),
+    metric(
+        "train/return_deviation",
+        "return",
+        "any",
+        "With normalise_values: the deviation of these returns, by which the critic's targets are divided; "
+        "0: all returns are alike so far.",
+    ),
+    metric(
+        "train/reward_scale",
+        "reward",
+        "any",
+        "With normalise_rewards: what the rewards of this rollout were divided by.",
     ),
     metric(
         "train/entropy",

@@ -74,8 +74,12 @@ class Settings:
 
     @classmethod
     def from_json(cls, data: Any, source: object = "settings.json") -> Self:
-        """The settings that `to_json` wrote; a name that is missing has its default. Raises ValueError."""
-        return cls().with_values(**cls.values_from_json(data, source))
+        """The settings that `to_json` wrote, in an older version too: a name that is missing has the value
+        that says what runs did before it was a setting, most often its default. Raises ValueError.
+        """
+        values = cls.values_from_json(data, source)
+        rule = rule_of(cls, values.get("algorithm"))
+        return cls().with_values(**{**_before(cls), **_before(rule), **values})
 
     @classmethod
     def values_from_json(cls, data: Any, source: object = "settings.json") -> dict[str, Any]:
@@ -99,6 +103,12 @@ def _shown(value: Any) -> str:
 def names(kind: type | None) -> set[str]:
     """The names of the fields that may be given; none for None."""
     return set() if kind is None else {field.name for field in dataclasses.fields(kind) if field.init}
+
+
+def _before(kind: type | None) -> dict[str, Any]:
+    """What runs did that do not have a setting of this class, by its name, where that is not its default."""
+    fields = () if kind is None else dataclasses.fields(kind)
+    return {field.name: field.metadata["before"] for field in fields if "before" in field.metadata}
 
 
 def rule_of(kind: type[Settings], algorithm: Any) -> type[Settings] | None:

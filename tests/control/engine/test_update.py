@@ -83,6 +83,17 @@ def test_heads(space, values, batch):
     check(*both(space, batch=batch, entropy_weight=0.03, **values))
 
 
+@pytest.mark.parametrize("entropy_weight", [0.0, 0.5])
+def test_deviations_on_both_sides_of_the_end_of_their_range(entropy_weight):
+    """The sum over all blocks of a minibatch tells whether its step leads back."""
+    values = {"minibatch_size": 300, "num_epochs": 6, "learning_rate": 0.01}
+    metrics, first, second = both("box", log_std_init=2.0, entropy_weight=entropy_weight, **values)
+    check(metrics, first, second)
+    start = make("box", log_std_init=2.0)[0].log_std.detach()
+    moved = next(x for x in first if x.shape == start.shape and x.ndim == 1)
+    assert ((start > 2) & (moved < start)).any() or entropy_weight
+
+
 def test_kl_stop_ends_all_epochs_before_the_step():
     values = {"target_kl": 0.02, "learning_rate": 0.01, "num_epochs": 8}
     result = both(updates=1, batch={"drift": 0.0}, **values)

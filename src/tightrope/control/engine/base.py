@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ class Acted(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """What advantages are computed from (see maths.returns): float32 and bool arrays [B, T]."""
+    """What advantages are computed from (see maths.returns): float64 and bool arrays [B, T]."""
 
     rewards: Array
     values: Array
@@ -52,8 +52,8 @@ class Engine(Protocol):
         """Where batches must lie."""
 
     @property
-    def policy(self) -> torch.nn.Module:
-        """The policy that acts and learns."""
+    def policy(self) -> Any:
+        """The `Policy` that acts and learns."""
 
     def begin_rollout(self, num_envs: int, rng: np.random.Generator) -> None:
         """Prepare to act in ``num_envs`` environments; ``rng`` is for exploration beyond the noise given."""
@@ -73,10 +73,10 @@ class Engine(Protocol):
         """
 
     def values(self, inputs: Inputs) -> Array:
-        """Values [N] of encoded observations [N, ...]."""
+        """The critic's outputs [N] for encoded observations [N, ...]."""
 
     def gae(self, steps: Steps, gamma: float, gae_lambda: float) -> Array:
-        """Advantages [B, T] float32: maths.returns.gae on arrays."""
+        """Advantages [B, T] float64: maths.returns.gae on arrays."""
 
     def update(
         self,

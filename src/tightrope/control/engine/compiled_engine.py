@@ -138,9 +138,9 @@ class CompiledEngine:
 
     def gae(self, steps: Steps, gamma: float, gae_lambda: float) -> Array:
         """See Engine. ValueError when the shapes differ: compiled code does not look."""
-        numbers = [_float(x) for x in steps[:3]]
+        numbers = [np.ascontiguousarray(x, np.float64) for x in steps[:3]]
         flags = [np.ascontiguousarray(x, bool) for x in steps[3:]]
-        out = np.empty(numbers[0].shape, np.float32)
+        out = np.empty(numbers[0].shape)
         if any(x.shape != out.shape for x in (*numbers, *flags)):
             raise ValueError(
                 f"All arrays of gae must have one shape; got {[x.shape for x in (*numbers, *flags)]}."

@@ -81,7 +81,7 @@ class TorchEngine:
 
     def gae(self, steps: Steps, gamma: float, gae_lambda: float) -> Array:
         """See Engine."""
-        tensors = {name: torch.from_numpy(x) for name, x in steps._asdict().items()}
+        tensors = {name: torch.from_numpy(x) for name, x in steps._asdict().items()}  # float64
         return returns.gae(**tensors, gamma=gamma, gae_lambda=gae_lambda).numpy()
 
     def update(

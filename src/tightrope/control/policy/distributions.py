@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,11 +24,37 @@ LOG_STD_RANGE = (-20.0, 2.0)
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
+class _Bounded(torch.autograd.Function):
+    """A clamp from which there is a way back: beyond the range the gradient is cut only where a step along it
+    would lead farther out.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        """x within LOG_STD_RANGE."""
+        ctx.save_for_backward(x)
+        return x.clamp(*LOG_STD_RANGE)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        """The gradient, 0 where it leads farther out."""
+        (x,) = ctx.saved_tensors
+        low, high = LOG_STD_RANGE
+        farther = ((x > high) & (grad < 0)) | ((x < low) & (grad > 0))
+        return torch.where(farther, 0.0, grad)
+
+
+def bounded(log_std: Tensor) -> Tensor:
+    """``log_std`` within LOG_STD_RANGE, with a gradient that leads back into it from outside."""
+    return _Bounded.apply(log_std)
+
+
 @dataclass(frozen=True)
 class Distribution:
     """A joint distribution over the components of an action; log-probability and entropy are their sums.
 
-    ``parameters`` [N, P]; ``log_std`` [d] or [N, d] for all Gaussian dimensions in order, None without any;
+    ``parameters`` [N, P]; ``log_std`` [d] or [N, d] for all Gaussian dimensions in order (what lies outside
+    LOG_STD_RANGE acts as its nearer end), None without any;
     ``mask`` [N, L] bool over all logits, None: everything is allowed; ``half_range`` [d]: tanh-squashed onto
     bounds of this half width, None: not squashed.
     """
@@ -36,6 +64,12 @@ class Distribution:
     log_std: Tensor | None = None
     mask: Tensor | None = None
     half_range: Tensor | None = None
+
+    @cached_property
+    def _bounded_log_std(self) -> Tensor:
+        """Once for log-probability and entropy: the sum of their gradients tells which way a step leads."""
+        assert self.log_std is not None
+        return bounded(self.log_std)
 
     def sample(self, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Actions [N, A] made of the given noise [N, A], and their log-probabilities [N]."""
@@ -110,9 +144,8 @@ class Distribution:
 
     def _gaussian(self, component: Component) -> tuple[Tensor, Tensor]:
         mean = self.parameters[:, component.parameter : component.parameter + component.count]
-        assert self.log_std is not None
         start = component.deviation
-        return mean, self.log_std[..., start : start + component.count].clamp(*LOG_STD_RANGE)
+        return mean, self._bounded_log_std[..., start : start + component.count]
 
     def _half_range(self, component: Component) -> Tensor:
         assert self.half_range is not None

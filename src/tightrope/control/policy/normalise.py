@@ -1,4 +1,6 @@
-"""Running statistics of observations and rewards: frozen during a rollout and its update, moved after it."""
+"""Running statistics of observations and rewards, frozen during a rollout and its update and moved after it,
+and the scale of returns, which the update moves before its first step.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from tightrope.algorithms.batch import scale_metrics
 from tightrope.algorithms.nonfinite import require_restorable
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces.observations import ObservationLayout
 from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.maths.statistics import RunningMoments
+from tightrope.maths.values import ReturnScale
 
 EDGE = 10.0  # deviations from the mean
-CLIP = 10.0  # of scaled rewards
 JITTER = 1e-12  # a smaller deviation is rounding of a task's own sums
 
 
@@ -79,10 +82,10 @@ class ObservationNormaliser:
 
 
 class RewardNormaliser:
-    """r / sqrt(Var(R) + 1e-8), clipped to +-10, where R_t = r_t + gamma R_{t-1} restarts after either kind of
-    end.
+    """r / sqrt(Var(R)), where R_t = r_t + gamma R_{t-1} restarts after either kind of end.
 
-    The mean is not subtracted: that would change which policy is best. ``deviation`` is the present scale.
+    Neither is the mean subtracted nor anything clipped: either would change which policy is best.
+    ``deviation`` is the present scale, 1 while all R are alike.
     """
 
     def __init__(self, num_envs: int, gamma: float) -> None:
@@ -92,11 +95,11 @@ class RewardNormaliser:
     @property
     def deviation(self) -> float:
         """What rewards are divided by, and values multiplied by to be in the task's units."""
-        return float(np.sqrt(float(self.moments.variance) + 1e-8)) if float(self.moments.count) > 1 else 1.0
+        return float(np.sqrt(float(self.moments.variance))) or 1.0
 
     def __call__(self, rewards: Array) -> Array:
-        """Scaled rewards, float32."""
-        return np.clip(rewards / self.deviation, -CLIP, CLIP).astype(np.float32)
+        """Scaled rewards."""
+        return rewards / self.deviation
 
     def update(self, rewards: Array, ended: Array, mask: Array) -> None:
         """Add the raw rewards [B, T] of a rollout; masked steps do not exist."""
@@ -122,18 +125,25 @@ class RewardNormaliser:
 
 
 class Normalisers:
-    """Both normalisers; None for one whose setting is off."""
+    """Both normalisers, and the scale in which the critic learns; None for one whose setting is off."""
 
-    def __init__(self, observations: ObservationNormaliser | None, rewards: RewardNormaliser | None) -> None:
-        self.observations, self.rewards = observations, rewards
+    def __init__(
+        self,
+        observations: ObservationNormaliser | None,
+        rewards: RewardNormaliser | None,
+        returns: ReturnScale | None = None,
+    ) -> None:
+        self.observations, self.rewards, self.returns = observations, rewards, returns
 
     @classmethod
     def of(cls, layout: ObservationLayout, num_envs: int, settings: TrainSettings) -> Normalisers:
         """Those that a run's settings ask for."""
         seen = settings.normalise_observations and bool(layout.size)
         observations = ObservationNormaliser(layout.continuous, settings.encoder == "old") if seen else None
-        scaled = settings.normalise_rewards
-        return cls(observations, RewardNormaliser(num_envs, settings.update.gamma) if scaled else None)
+        rewards = RewardNormaliser(num_envs, settings.update.gamma) if settings.normalise_rewards else None
+        # without a baseline there is no critic to learn anything
+        learned = settings.update.normalise_values and getattr(settings.update, "baseline", True)
+        return cls(observations, rewards, ReturnScale() if learned else None)
 
     @property
     def ready(self) -> bool:
@@ -149,29 +159,40 @@ class Normalisers:
         return {**inputs, "flat": seen}
 
     def scaled_rewards(self, rollout: Any) -> Array:
-        """The rewards of a rollout to learn from, float32. The first rollout of all is scaled by its own
-        statistics: there are no others.
+        """The rewards of a rollout to learn from. The first rollout of all is scaled by its own statistics:
+        there are no others.
         """
         if self.rewards is None:
-            return rollout.rewards.astype(np.float32)
+            return rollout.rewards
         if float(self.rewards.moments.count) == 0:
             self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
             rollout.reward_statistics_taken = True
         return self.rewards(rollout.rewards)
 
     def update(self, rollout: Any) -> None:
-        """Move the statistics, after the update on this rollout."""
+        """Move the statistics of observations and rewards, after the update on this rollout."""
         if self.observations is not None:
             self.observations.update(rollout.raw[rollout.mask])
         if self.rewards is not None and not rollout.reward_statistics_taken:
             self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
 
+    def metrics(self) -> dict[str, float]:
+        """The present scales of returns and rewards."""
+        found = scale_metrics(self.returns)
+        if self.rewards is not None:
+            found["train/reward_scale"] = self.rewards.deviation
+        return found
+
     def state(self) -> dict[str, torch.Tensor]:
         """All tensors, with the kind as prefix."""
         parts = {"observations": self.observations, "rewards": self.rewards}
-        return {
+        found = {
             f"{k}.{n}": x for k, part in parts.items() if part is not None for n, x in part.state().items()
         }
+        if self.returns is not None:
+            numbers = vars(self.returns).items()
+            found |= {f"returns.{name}": torch.tensor(x, dtype=torch.float64) for name, x in numbers}
+        return found
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
         """Load a `state`. ValueError for statistics of other observations: the compiled engine
@@ -187,3 +208,5 @@ class Normalisers:
                     low = 0.0 if name in ("count", "variance") else -math.inf
                     require_restorable(f"{prefix}{name}", found[name], own, at_least=low)
                 part.load(found)
+        if self.returns is not None:
+            self.returns = ReturnScale(*(float(state[f"returns.{name}"]) for name in vars(self.returns)))

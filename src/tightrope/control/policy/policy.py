@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 from torch import Tensor, nn
 
 from tightrope.algorithms.batch import Batch, Evaluation
-from tightrope.control.policy.distributions import Distribution
+from tightrope.control.policy.distributions import Distribution, bounded
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces.actions import ActionLayout
 from tightrope.control.spaces.observations import ObservationLayout, channels_last
@@ -156,6 +156,11 @@ class Policy(nn.Module):
         device = self.device
         return {name: torch.from_numpy(np.ascontiguousarray(x)).to(device) for name, x in arrays.items()}
 
+    @property
+    def last_critic_layer(self) -> nn.Linear | None:
+        """The layer that gives the critic's output; None for a user's own module."""
+        return None if self.critic is None else self.critic[-1]  # type: ignore[return-value]
+
     def critic_parameters(self) -> list[nn.Parameter]:
         """The parameters that only the critic uses; empty for a user's own module."""
         return list(self.critic.parameters()) if self.critic is not None else []
@@ -169,7 +174,7 @@ class Policy(nn.Module):
         return Evaluation(logp.view(shape), distribution.entropy().view(shape), values.view(shape))
 
     def evaluate(self, inputs: InputTensors) -> tuple[Distribution, Tensor]:
-        """Distribution and values [N] of encoded observations [N, ...]."""
+        """Distribution and the critic's outputs [N] for encoded observations [N, ...]."""
         if self.own is not None:
             parameters, values = self._own_outputs(inputs)
             return self._distribution(parameters, None, inputs), values
@@ -181,7 +186,9 @@ class Policy(nn.Module):
 
     @torch.no_grad()
     def values(self, arrays: Inputs) -> Tensor:
-        """Only the values [N] of encoded observations [N, ...]."""
+        """Only the critic's outputs [N] for encoded observations [N, ...]: values in its scale
+        (`ReturnScale`).
+        """
         inputs = self._tensors(arrays)
         if self.own is not None:
             return self._own_outputs(inputs)[1]
@@ -205,9 +212,7 @@ class Policy(nn.Module):
         random = torch.from_numpy(noise).to(self.device)
         if self.gsde and self.exploration is not None:
             assert latent is not None and self.log_std is not None and distribution.log_std is not None
-            held = torch.einsum(
-                "nf,nfd->nd", latent, self.exploration[rows] * self.log_std.clamp(-20, 2).exp()
-            )
+            held = torch.einsum("nf,nfd->nd", latent, self.exploration[rows] * bounded(self.log_std).exp())
             random = random.clone()
             random[:, self.layout.gaussian] = held * (-distribution.log_std).exp()
         return distribution.sample(random)
@@ -249,7 +254,7 @@ class Policy(nn.Module):
             # the matrix is Gaussian, so the action given the state is too: var = sum_f (phi_f std_f)^2,
             # exactly
             assert latent is not None and self.log_std is not None
-            variance = latent.detach().square() @ (2.0 * self.log_std.clamp(-20, 2)).exp()
+            variance = latent.detach().square() @ (2.0 * bounded(self.log_std)).exp()
             log_std = 0.5 * torch.log(variance + 1e-6)
         return Distribution(self.layout, parameters, log_std, inputs.get("action_mask"), self.half_range)
 

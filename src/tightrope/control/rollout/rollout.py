@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.batch import Batch, move_scale
 from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
 from tightrope.control.engine.base import Engine, Steps
 from tightrope.control.environments.base import Environments
 from tightrope.control.policy.normalise import EDGE, Normalisers
 from tightrope.control.spaces.structure import Array, Inputs
+from tightrope.maths.values import ReturnScale
 
 
 class Rollout:
@@ -67,7 +68,7 @@ class Rollout:
         self.warm_up = 0
 
 
-def scale_metrics(rollout: Rollout, environments: Environments, normalisers: Normalisers) -> dict[str, float]:
+def cut_shares(rollout: Rollout, environments: Environments, normalisers: Normalisers) -> dict[str, float]:
     """The shares of a rollout's numbers that were cut off at a bound, or pressed together as outliers."""
     clipped = environments.action_layout.clipped_share(rollout.actions[rollout.mask])
     found = {} if clipped is None else {"rollout/action_clip_fraction": clipped}
@@ -78,10 +79,17 @@ def scale_metrics(rollout: Rollout, environments: Environments, normalisers: Nor
     return found
 
 
-def to_batch(rollout: Rollout, engine: Engine, normalisers: Normalisers, settings: UpdateSettings) -> Batch:
-    """Values, advantages and returns of a rollout, as a Batch [B, T]."""
+def to_batch(
+    rollout: Rollout, engine: Engine, normalisers: Normalisers, settings: UpdateSettings, move: bool = False
+) -> Batch:
+    """Values, advantages and returns of a rollout, as a Batch [B, T] in the scale of returns.
+
+    ``move``: first the scale moves to these returns, and the critic's last layer with it, so that values
+    stay; a module of the user's has to follow by learning.
+    """
     rewards = normalisers.scaled_rewards(rollout)
-    values, following = critic_values(rollout, engine)
+    scale = normalisers.returns or ReturnScale(deviation=1.0)
+    values, following = (scale.values(torch.from_numpy(x)).numpy() for x in critic_values(rollout, engine))
     mask = rollout.mask
     if isinstance(settings, ReinforceSettings) and not settings.baseline:
         mask = mask & finished(rollout.ended, mask)
@@ -93,7 +101,7 @@ def to_batch(rollout: Rollout, engine: Engine, normalisers: Normalisers, setting
     def tensor(array: Array) -> torch.Tensor:
         return torch.from_numpy(array).to(engine.device)
 
-    return Batch(
+    batch = Batch(
         inputs={name: tensor(x) for name, x in rollout.inputs.items()},
         actions=tensor(rollout.actions),
         old_logp=tensor(rollout.logp),
@@ -102,10 +110,13 @@ def to_batch(rollout: Rollout, engine: Engine, normalisers: Normalisers, setting
         returns=tensor(advantages + values),
         mask=tensor(mask),
     )
+    if move and normalisers.returns is not None:
+        normalisers.returns = move_scale(normalisers.returns, batch, engine.policy.last_critic_layer)
+    return batch.in_scale(normalisers.returns, advantages=settings.normalise_advantages)
 
 
 def critic_values(rollout: Rollout, engine: Engine) -> tuple[Array, Array]:
-    """V of every observation, and of the true next observation of every step, both [B, T].
+    """The critic's output for every observation, and for the true next observation of every step, [B, T].
 
     The second differs from a shift of the first at the end of the rollout and at truncations.
     """

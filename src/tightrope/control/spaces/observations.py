@@ -121,6 +121,18 @@ class ObservationLayout:
             inputs[leaf.name] = zeros(shape, np.uint8 if of_bytes else np.float32)
         return inputs
 
+    def is_batched(self, observation: Any) -> bool:
+        """Whether an observation has one axis more than its space. ValueError where it is none of the space."""
+        leaf, part = self.leaves[0], observation
+        try:
+            for key in leaf.path:
+                part = part[key]
+            return np.ndim(part) > len(leaf.space.shape or ())
+        except (LookupError, TypeError, ValueError) as error:  # no such key, no dict, rows of several lengths
+            raise ValueError(
+                f"The observation is {repr(observation)[:80]}; expected one of {self.space}, or a batch of them."
+            ) from error
+
     def encode(self, observations: Any, batched: bool) -> Inputs:
         """Inputs of one observation (N = 1) or of a batch in the form of Gymnasium's vector environments.
 

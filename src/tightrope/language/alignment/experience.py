@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import time
 from collections.abc import Iterator, Sequence
@@ -11,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.batch import Batch, move_scale
 from tightrope.algorithms.micro_batches import OutOfMemory, free, is_out_of_memory
 from tightrope.language.alignment.kl import kl_rewards
 from tightrope.language.data.batching import length_groups, pad_left
@@ -25,6 +26,7 @@ from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings
 from tightrope.maths import returns
 from tightrope.maths.statistics import masked_variance
+from tightrope.maths.values import ReturnScale
 
 
 class PromptOrder:
@@ -206,9 +208,15 @@ def rewards_of(
     return TokenRewards(torch.where(mask, rewards * scale, 0.0), share, scale)
 
 
-def batch_of(experience: Experience, rewards: Tensor, valid: Tensor, settings: AlignSettings) -> Batch:
-    """Advantages and returns of the responses whose score counts (``valid`` [B]), as ppo.update takes
-    them.
+def batch_of(
+    experience: Experience,
+    rewards: Tensor,
+    valid: Tensor,
+    settings: AlignSettings,
+    scale: ReturnScale | None = None,
+) -> Batch:
+    """Values, advantages and returns of the responses whose score counts (``valid`` [B]), in units of the
+    rewards. ``scale``: that of the critic's outputs; None: they are values.
     """
     mask, rows = experience.responses.mask, torch.arange(len(experience.tokens))
     last, ended = mask.sum(1) - 1, torch.zeros_like(mask)
@@ -216,13 +224,15 @@ def batch_of(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
     terminated = ended.clone()
     if settings.truncation == "bootstrap":
         terminated[rows, last] = experience.responses.ended
-    update, values = settings.update, experience.values
+    update, values, final_values = settings.update, experience.values, experience.final_values
+    if scale is not None:
+        rewards, values, final_values = rewards.double(), scale.values(values), scale.values(final_values)
     if settings.critic == "none":
         advantages = leave_one_out(rewards, mask, valid, settings.samples_per_prompt, settings.update.gamma)
         targets = torch.zeros_like(rewards)
     else:
         following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], 1)
-        following = torch.where(ended, experience.final_values[:, None], following)
+        following = torch.where(ended, final_values[:, None], following)
         policy_lambda: float | Tensor = update.gae_lambda
         if settings.lambda_alpha is not None:
             policy_lambda = length_lambda(mask.sum(1), settings.lambda_alpha)
@@ -253,6 +263,23 @@ def batch_of(experience: Experience, rewards: Tensor, valid: Tensor, settings: A
     known = {name: x for name, x in vars(inputs).items() if x is not None}
     batch = Batch(known, experience.responses.tokens, old, values, advantages, targets, mask)
     return batch.select(valid.nonzero()[:, 0])
+
+
+def to_scale(
+    batch: Batch, experience: Experience, before: ReturnScale | None, head: nn.Linear | None
+) -> tuple[Batch, ReturnScale | None]:
+    """The batch as the critic learns it, after the scale of returns has moved to it, and that scale. The
+    critic's head moves along, and so do the outputs of a pass that was kept.
+    """
+    if before is None:
+        return batch.in_scale(None, advantages=False), None
+    now = move_scale(before, batch, head)
+    if experience.first_pass is not None:
+        outputs, (factor, shift) = experience.first_pass.values, before.change(now)
+        # the graph holds the head that has moved: only the numbers are still those from before
+        moved = outputs + (factor * outputs + shift - outputs).detach()
+        experience.first_pass = dataclasses.replace(experience.first_pass, values=moved)
+    return batch.in_scale(now, advantages=False), now
 
 
 def length_lambda(lengths: Tensor, alpha: float) -> Tensor:

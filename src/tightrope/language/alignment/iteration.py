@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from tightrope.algorithms import ppo
-from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.batch import Batch, scale_metrics
 from tightrope.algorithms.optimise import make_optimiser, set_learning_rates
 from tightrope.language.alignment.experience import (
     PromptOrder,
@@ -23,6 +23,7 @@ from tightrope.language.alignment.experience import (
     has_baseline,
     respond,
     rewards_of,
+    to_scale,
 )
 from tightrope.language.alignment.figures import refuse_bad_numbers, refuse_mismatch, rollout_metrics
 from tightrope.language.alignment.kl import adapted, kl_loss, shared_scale
@@ -48,7 +49,7 @@ from tightrope.language.reward.judge import (
     shares_trunk,
 )
 from tightrope.language.settings import AlignSettings, RLHFSettings
-from tightrope.maths.values import explained_variance
+from tightrope.maths.values import ReturnScale, explained_variance
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import counted, understood
 from tightrope.runs.records import figures
@@ -122,6 +123,10 @@ class Trainer:
         self.optimiser = make_optimiser(
             self.roles.parameters(), self.roles.critic_parameters(), settings.update
         )
+        self.return_scale: ReturnScale | None = None
+        if settings.update.normalise_values and settings.critic != "none":
+            # what the critic knows from the reward model is known in units of the reward
+            self.return_scale = ReturnScale(deviation=1.0 if settings.critic_from_reward else 0.0)
         self.order = PromptOrder(len(self.prompts), settings.seed)
         self.update_rng = np.random.default_rng([settings.seed, 9])
         self.kl_beta = settings.kl_beta
@@ -256,6 +261,8 @@ class Trainer:
             "rng": {"update": self.update_rng.bit_generator.state},
             "monitor": self.monitor.state(),
         }
+        if self.return_scale is not None:
+            state["return_scale"] = vars(self.return_scale)
         if self.pretraining is not None:
             state["rng"]["ptx"] = self.pretraining.rng.bit_generator.state
         return state
@@ -269,6 +276,8 @@ class Trainer:
         self.order.position = counted(state["prompt_position"])
         self.update_rng.bit_generator.state = state["rng"]["update"]
         self.monitor.restore(state["monitor"])
+        if self.return_scale is not None:
+            self.return_scale = ReturnScale(**state["return_scale"])
         if self.pretraining is not None:
             self.pretraining.rng.bit_generator.state = state["rng"]["ptx"]
 
@@ -329,7 +338,9 @@ class Trainer:
         begin = time.perf_counter()
         if taken.counts and not self.stopped:
             # a KL in the loss is scaled as the rewards were
-            metrics |= self._update(taken.batch, present, experience, self.kl_beta * taken.scale)
+            adapters = settings.tune == "lora" and settings.critic != "separate"
+            with whole_update(self._update_seconds, self._learned, self._unlearn if adapters else None):
+                metrics |= self._update(taken.batch, present, experience, self.kl_beta * taken.scale)
             if settings.critic != "none":
                 metrics["train/explained_variance"] = float(
                     explained_variance(taken.batch.old_values, taken.batch.returns, taken.batch.mask)
@@ -374,7 +385,7 @@ class Trainer:
             scores.valid[:] = has_baseline(scores.valid, settings.samples_per_prompt)
         found = rewards_of(experience, scores, settings, self.kl_beta)
         valid = torch.from_numpy(scores.valid).to(experience.tokens.device)
-        batch = batch_of(experience, found.rewards, valid, settings)
+        batch = batch_of(experience, found.rewards, valid, settings, self.return_scale)
         plain = found.rewards / found.scale  # the metrics are those before whiten_rewards
         metrics = rollout_metrics(experience, scores, plain, found.kl_share, valid) | scores.metrics | gold
         gap = metrics["objective/sampling_gap"]
@@ -388,6 +399,7 @@ class Trainer:
     ) -> dict[str, float]:
         """PPO, or only the critic while it warms up. ``kl_weight``: of a KL in the loss."""
         warming = self.iteration < self.settings.critic_warmup
+        batch, self.return_scale = to_scale(batch, experience, self.return_scale, self.roles.critic_head)
         model = PolicyModel(self.roles, critic_only=warming, first_pass=experience.first_pass)
         experience.first_pass = None  # where memory runs out, nothing else may hold on to its graph
         if warming:
@@ -399,21 +411,19 @@ class Trainer:
             batch = dataclasses.replace(batch, advantages=advantages)
             kl_weight, present = kl_weight * float(scale), present.unchecked(normalise_advantages=False)
         extra = None if warming else self._extra_loss(kl_weight)
-        adapters = self.settings.tune == "lora" and self.settings.critic != "separate"
-        with whole_update(self._update_seconds, self._learned, self._unlearn if adapters else None):
-            metrics = ppo.update(
-                model,
-                self.optimiser,
-                batch,
-                present.unchecked(micro_batch_size=self.micro_batch_size),
-                self.update_rng,
-                extra_loss=extra,
-                draw=None if extra is None or self.pretraining is None else self.pretraining.draw,
-                log_ratio_limit=self.log_ratio_limit,
-            )
+        metrics = ppo.update(
+            model,
+            self.optimiser,
+            batch,
+            present.unchecked(micro_batch_size=self.micro_batch_size),
+            self.update_rng,
+            extra_loss=extra,
+            draw=None if extra is None or self.pretraining is None else self.pretraining.draw,
+            log_ratio_limit=self.log_ratio_limit,
+        )
         if "train/micro_batch_size" in metrics:
             self._smaller(int(metrics["train/micro_batch_size"]))
-        return metrics
+        return metrics | scale_metrics(self.return_scale)
 
     def _smaller(self, size: int) -> None:
         """Memory ran out: ``size`` responses a pass from now on."""

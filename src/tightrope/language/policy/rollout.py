@@ -24,9 +24,10 @@ class Experience(Completions):
     """Completions, and what the roles compute for them.
 
     ``logp``, ``ref_logp``, ``entropy``, ``exact`` (KL of the state), ``values``: [B, R]. ``final_values``
-    [B]: V of the state after the last token. ``lower`` and ``ref_hidden`` are kept for the epochs that
-    follow. ``first_pass`` holds the same numbers with their graph, for the first step of the first epoch;
-    ``short_of_memory``: it was asked for and did not fit.
+    [B]: that of the state after the last token. Values are the critic's outputs, in its scale
+    (`ReturnScale`). ``lower`` and ``ref_hidden`` are kept for the epochs that follow. ``first_pass`` holds
+    the same numbers with their graph, for the first step of the first epoch; ``short_of_memory``: it was
+    asked for and did not fit.
     """
 
     logp: Tensor

@@ -149,7 +149,7 @@ def gradient_of_outputs(places, components, flat, grad, work, n, entropy_share):
 
     With c = COEFFICIENT, w = entropy_share:
     categorical: c (1[k = a] - p_k) + w p_k (log p_k + H);  bit: c (b - p) + w z p (1 - p); gaussian: c (a -
-    mean) / std^2, and c (((a - mean) / std)^2 - 1) - w for its log_std (0 outside the clamp).
+    mean) / std^2, and c (((a - mean) / std)^2 - 1) - w for its log_std (see `cut_deviations`).
     """
     w, c = entropy_share, row(work, places[plan.VECTORS] + plan.COEFFICIENT, n)
     for j in range(len(components)):
@@ -175,13 +175,21 @@ def gradient_of_outputs(places, components, flat, grad, work, n, entropy_share):
                     g[i] = ZERO if p < ZERO else value
             else:
                 place = places[plan.LOG_STD] + components[j, plan.DEVIATION] + k
-                log_std, total = clamp_log_std(flat[place]), ZERO
-                inverse = exp(-log_std)
+                inverse, total = exp(-clamp_log_std(flat[place])), ZERO
                 for i in range(n):
                     g[i] = c[i] * s[i] * inverse
                     total += c[i] * (s[i] * s[i] - ONE) - w
-                if flat[place] == log_std:
-                    grad[place] += total
+                grad[place] += total
+
+
+@kernel
+def cut_deviations(places, flat, grad):
+    """Cut the gradient of a log deviation outside its range where a step along it would lead farther out."""
+    for k in range(places[plan.DEVIATIONS]):
+        place = places[plan.LOG_STD] + k
+        above, below = flat[place] > LOG_STD_HIGH, flat[place] < LOG_STD_LOW
+        if (above and grad[place] < ZERO) or (below and grad[place] > ZERO):
+            grad[place] = ZERO
 
 
 @kernel

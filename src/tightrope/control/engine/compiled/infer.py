@@ -79,22 +79,21 @@ def value_batch(places, layers, flat, work, inputs, out):
 
 
 @entry(
-    "void(float32[:,::1], float32[:,::1], float32[:,::1], boolean[:,::1], boolean[:,::1], boolean[:,::1],"
-    "float64, float64, float32[:,::1])"
+    "void(float64[:,::1], float64[:,::1], float64[:,::1], boolean[:,::1], boolean[:,::1], boolean[:,::1],"
+    "float64, float64, float64[:,::1])"
 )
 def gae_batch(rewards, values, next_values, terminated, ended, mask, gamma, gae_lambda, out):
     """A_t = r_t + gamma V_{t+1} - V_t + gamma lambda A_{t+1}, cut as in maths.returns.gae.
 
     Numbers behind a cut may be anything: they are not used.
     """
-    discount, decay = f(gamma), f(gamma * gae_lambda)
     for b in range(rewards.shape[0]):
-        trace = ZERO
+        trace = 0.0
         for t in range(rewards.shape[1] - 1, -1, -1):
             delta = rewards[b, t] - values[b, t]
             if not terminated[b, t]:
-                delta += discount * next_values[b, t]
-            trace = delta if ended[b, t] else delta + decay * trace
+                delta += gamma * next_values[b, t]
+            trace = delta if ended[b, t] else delta + gamma * gae_lambda * trace
             if not mask[b, t]:
-                trace = ZERO
+                trace = 0.0
             out[b, t] = trace

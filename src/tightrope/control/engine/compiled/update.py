@@ -14,7 +14,11 @@ import numpy as np
 
 from tightrope.control.engine.compiled import plan
 from tightrope.control.engine.compiled.cache import entry
-from tightrope.control.engine.compiled.distributions import evaluate_actions, gradient_of_outputs
+from tightrope.control.engine.compiled.distributions import (
+    cut_deviations,
+    evaluate_actions,
+    gradient_of_outputs,
+)
 from tightrope.control.engine.compiled.layers import backward, forward
 from tightrope.control.engine.compiled.primitives import (
     ONE,
@@ -244,6 +248,8 @@ def gradients(role, places, layers, components, flat, grad, work, data, order, b
                 ledgers[1],
             )
         backward(flat, grad, layers, runtime(0), trunk, work, n, more, runtime(False))
+    if role & ACTOR:
+        cut_deviations(places, flat, grad)
 
 
 @kernel
