@@ -33,7 +33,7 @@ from tightrope.control.engine.compiled_engine import CompiledEngine
 from tightrope.control.engine.compiled import infer
 needed = memory() - before
 import engine_cases
-x = np.arange(12, dtype=np.float32).reshape(3, 4)
+x = np.arange(12, dtype=np.float64).reshape(3, 4)
 no, yes, out = np.zeros(x.shape, bool), np.ones(x.shape, bool), np.empty_like(x)
 infer.gae_batch(x, x + 1, x + 2, no, no, yes, 0.99, 0.95, out)
 policy, optimiser, settings = engine_cases.make()

@@ -122,7 +122,7 @@ class ObservationLayout:
         return inputs
 
     def is_batched(self, observation: Any) -> bool:
-        """Whether an observation has one axis more than its space. ValueError where it is none of the space."""
+        """Whether an observation has one axis more than its space. ValueError where it is none of it."""
         leaf, part = self.leaves[0], observation
         try:
             for key in leaf.path:
@@ -130,7 +130,8 @@ class ObservationLayout:
             return np.ndim(part) > len(leaf.space.shape or ())
         except (LookupError, TypeError, ValueError) as error:  # no such key, no dict, rows of several lengths
             raise ValueError(
-                f"The observation is {repr(observation)[:80]}; expected one of {self.space}, or a batch of them."
+                f"The observation is {repr(observation)[:80]}; expected one of {self.space}, or a batch of "
+                "them."
             ) from error
 
     def encode(self, observations: Any, batched: bool) -> Inputs:
