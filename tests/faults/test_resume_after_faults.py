@@ -87,9 +87,9 @@ def test_rollbacks_of_a_control_run(tmp_path, monkeypatch):
     assert Run.open(hops).newest().state["rollbacks"] == 2
     assert_same_end(tmp_path / "whole", hops)
     steps = [json.loads(line)["step"] for line in (hops / "metrics.jsonl").read_text().splitlines()]
-    assert steps == [100, 200, 300, 400, 500, 600]
+    assert steps == [100, 200, 300, 400, 500, 600, 600]  # the final evaluation is a row
     evaluated = [json.loads(line) for line in (hops / "metrics.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in evaluated if "eval/episodes" in row] == [300, 500]
+    assert [row["step"] for row in evaluated if "eval/episodes" in row] == [300, 500, 600]
 
 
 def test_a_resumed_run_has_no_more_rollbacks_than_it_would_have_had(tmp_path, monkeypatch):

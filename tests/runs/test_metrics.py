@@ -16,6 +16,8 @@ KNOWN_TO_USERS = [
     "rollout/new_ep_rew_mean",
     "rollout/new_ep_len_mean",
     "rollout/success_rate",
+    "rollout/action_clip_fraction",
+    "rollout/observation_outlier_fraction",
     "rollout/environment_restarts",
     "time/fps",
     "time/seconds",

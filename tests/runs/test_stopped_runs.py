@@ -203,7 +203,7 @@ def test_a_full_disk_is_told_and_the_run_still_ends(tmp_path, monkeypatch):
 
 SHORT = {
     "num_envs": 2, "num_steps": 50, "minibatch_size": 50, "num_epochs": 2, "hidden": (8,), "seed": 1,
-    "engine": "torch", "threads": 1,
+    "engine": "torch", "threads": 1, "normalise_observations": False,
 }  # fmt: skip
 
 
