@@ -37,7 +37,6 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "learning_rate": 1e-3,
         "entropy_weight": 0.0,
         "normalise_observations": True,
-        "normalise_rewards": True,
         "total_steps": 100_000,
     },
     "Acrobot-v1": {
@@ -57,7 +56,6 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "std": "gsde",
         "gsde_steps": 256,
         "normalise_observations": True,
-        "normalise_rewards": True,
         "total_steps": 100_000,
     },
     "Pendulum-v1": {
@@ -66,13 +64,12 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "gamma": 0.95,
         "learning_rate": 1e-3,
         "activation": "relu",
-        "normalise_rewards": True,
         "total_steps": 200_000,
     },
     "LunarLander-v3": {**_LANDER, "entropy_weight": 0.01},
     "LunarLanderContinuous-v3": _LANDER,
     "HalfCheetah-v5": {**_MUJOCO, "log_std_init": -1.0, "total_steps": 1_000_000},
-    "Hopper-v5": {**_MUJOCO, "total_steps": 1_000_000},
+    "Hopper-v5": {**_MUJOCO, "normalise_rewards": False, "total_steps": 1_000_000},
     "Walker2d-v5": {**_MUJOCO, "log_std_init": -1.0, "total_steps": 1_000_000},
 }
 
