@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import decimal
+import json
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
@@ -130,7 +132,7 @@ def add_fields(
     """
     fields = settings_fields(kind)
     for name in names:
-        field, (plain, optional) = fields[name], kinds(kind)[name]
+        field, (plain, optional, _) = fields[name], kinds(kind)[name]
         flag = "--" + name.replace("_", "-")
         text = help_text(field, optional, (presets or {}).get(name, "{}"))
         if plain is bool:
@@ -138,7 +140,11 @@ def add_fields(
                 flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text
             )
         elif plain is tuple:
-            group.add_argument(flag, nargs="*", type=width, metavar="N", help=text)
+            whole = kinds(kind)[name].items is int
+            metavar, read = ("N", width) if whole else ("KEY", str)
+            group.add_argument(flag, nargs="*", type=read, metavar=metavar, help=text)
+        elif plain is dict:
+            group.add_argument(flag, nargs="*", type=pair, action=_Pairs, metavar="NAME=VALUE", help=text)
         else:
             choices = field.metadata["choices"]
             metavar = {str: "WORD", int: "N", float: "X"}[plain]
@@ -153,7 +159,7 @@ def help_text(field: dataclasses.Field[Any], optional: bool, written: str = "{}"
     elif isinstance(default, bool):
         shown = "on" if default else "off"
     elif isinstance(default, tuple):
-        shown = " ".join(str(item) for item in default)
+        shown = " ".join(str(item) for item in default) or "none"
     else:
         shown = f"{default:g}" if isinstance(default, float) else str(default)
     limits = range_text(field.metadata)
@@ -192,6 +198,44 @@ def width(word: str) -> int:
     except ValueError:
         text = f"{word!r} is not a whole number. Give the task before this list: train ENV --hidden 64 64"
         raise argparse.ArgumentTypeError(text) from None
+
+
+NONE = ("none", None)  # the word none in place of a pair
+
+
+def pair(word: str) -> tuple[str, Any]:
+    """``name=value``; the value as JSON where it is that, as a whole number like 1e6, none, or the word
+    itself."""
+    name, equals, text = word.partition("=")
+    if word.lower() == "none":
+        return NONE
+    if not equals or not name:
+        raise argparse.ArgumentTypeError(
+            f"{word!r} is not NAME=VALUE. Give the task before this list: train ENV --env-kwargs size=8"
+        )
+    known = {"none": None, "true": True, "false": False}
+    if text.lower() in known:
+        return name, known[text.lower()]
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = text
+    if isinstance(value, str) or (isinstance(value, float) and "e" in text.lower()):
+        with contextlib.suppress(ValueError, OverflowError):
+            return name, whole_number(text)
+    return name, value
+
+
+class _Pairs(argparse.Action):
+    """Collects pairs in a dict; the word none alone: no dict."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        if values == [NONE]:
+            setattr(namespace, self.dest, None)
+            return
+        if len({name for name, _ in values}) < len(values):
+            raise argparse.ArgumentError(self, "a name was given twice, expected once. Leave one out.")
+        setattr(namespace, self.dest, dict(values))
 
 
 def whole_number(word: str) -> int:

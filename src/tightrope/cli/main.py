@@ -24,7 +24,7 @@ from tightrope.cli.options import (
     sample_parser,
     stdout_for_json,
 )
-from tightrope.cli.train_commands import require_transformers, resume, train
+from tightrope.cli.train_commands import look_again, require_transformers, resume, train
 from tightrope.errors import TightropeError
 from tightrope.runs import signals
 from tightrope.runs.durable import CannotWrite
@@ -36,7 +36,10 @@ CANNOT_WRITE = 74  # EX_IOERR of sysexits.h
 def _evaluate(words: list[str]) -> int:
     """``tightrope evaluate RUN``: how good the saved policy is."""
     given = evaluate_parser().read(words)
+    if os.path.exists(given["run"]):
+        given["run"] = os.path.abspath(given["run"])  # user code may change the working directory
     import_env_module(given)
+    look_again(given)
     from tightrope.control.saving import evaluate_run
 
     names = ("episodes", "stochastic", "best", "seed", "env", "device", "evaluation_max_steps")
@@ -55,7 +58,10 @@ def _evaluate(words: list[str]) -> int:
 def _record(words: list[str]) -> int:
     """``tightrope record RUN``: an mp4 of the saved policy."""
     given = record_parser().read(words)
+    if os.path.exists(given["run"]):
+        given["run"] = os.path.abspath(given["run"])  # user code may change the working directory
     import_env_module(given)
+    look_again(given)
     from tightrope.control.record import record_run
 
     names = ("out", "best", "episodes", "seed", "env")

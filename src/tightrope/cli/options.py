@@ -35,7 +35,7 @@ PROGRAM = "tightrope"
 
 # The groups of train --help; every setting is in one.
 GROUPS = {
-    "task": ("algorithm", "total_steps", "seed"),
+    "task": ("env_kwargs", "observation_keys", "algorithm", "total_steps", "seed"),
     "rollout": ("num_envs", "num_steps", "action_bounds", "normalise_observations", "normalise_rewards"),
     "networks": ("hidden", "activation", "shared", "encoder", "std", "log_std_init", "gsde_steps"),
     "update rule": (),

@@ -49,9 +49,13 @@ def train(command: str, words: list[str]) -> int:
         env = values.pop("env", None)
         if env is None:
             raise UsageError("Which task? Give a Gymnasium id: tightrope train CartPole-v1")
+        if given.get("run_dir"):
+            given["run_dir"] = os.path.abspath(given["run_dir"])  # user code may change the working directory
         import_env_module(given)
+        from tightrope.control.environments.make import look_first
         from tightrope.control.resolve import resolve_with_preset
 
+        look_first(env, values.get("env_kwargs"))
         settings: Settings
         settings, preset = resolve_with_preset(env, values.pop("algorithm", "ppo"), values)
         origins = dict.fromkeys(preset, "preset") | origins
@@ -76,7 +80,9 @@ def resume(words: list[str]) -> int:
     command = command_of(settings) or "align"
     total = given.get("total_steps")
     if command == "train":
+        given["run"] = os.path.abspath(given["run"])
         import_env_module(given)
+        look_again(given, settings)
         values = {"total_steps": total, "env": given.get("env")}
     elif command == "align":
         values = {"total_episodes": total, "prompts": given.get("data")}
@@ -90,6 +96,20 @@ def resume(words: list[str]) -> int:
                 )
         values = {"data": given.get("data")}
     return _watched(command, given, RESUME, given["run"], **values)
+
+
+def look_again(given: Options, settings: dict[str, Any] | None = None) -> None:
+    """`look_first` for the task of a run, or the one of --env in its place."""
+    from tightrope.control.environments.make import look_first
+
+    if settings is None:
+        try:
+            settings = Run.open(given["run"]).settings
+        except ValueError:  # a folder of agent.save, or none
+            return
+    env = given.get("env", settings.get("env"))
+    if isinstance(env, str) and ("env" in given or ":" not in env):  # no file may name what is imported
+        look_first(env, settings.get("env_kwargs") if env == settings.get("env") else None)
 
 
 def _functions(command: str) -> tuple[Training, Training]:

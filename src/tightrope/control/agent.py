@@ -31,16 +31,17 @@ from tightrope.control.environments.faults import policy_of, require_finite
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
+from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.policy.policy import Policy
-from tightrope.control.resolve import require_room, resolve
+from tightrope.control.resolve import anywhere, require_room, resolve
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.episodes import FinishedEpisodes
 from tightrope.control.rollout.rollout import cut_shares, to_batch
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces.structure import Array, Inputs, Reading, structure
 from tightrope.maths.values import explained_variance
-from tightrope.runs import checkpoint, signals
+from tightrope.runs import checkpoint, generators, signals
 from tightrope.training.events import Message
 from tightrope.training.learner import Update, crosses
 from tightrope.training.memory import DoesNotFit
@@ -72,13 +73,14 @@ class Agent:
         self.settings = settings or resolve(env, self.algorithm, values)
         self.env = env
         require_room(self.settings)
-        self.environments = _environments(env, self.settings)
         present = self.settings
+        with generators.apart(present.seed):  # what constructors draw
+            self.environments = _environments(env, present)
         torch_device = usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
         self._require_room(present, policy)
         threads = present.threads or (available_cores() if layouts[0].images else 1)
-        with limited_threads(threads):  # the QR of the first weights rounds differently with more threads
+        with limited_threads(threads), generators.apart(present.seed):  # QR's bits depend on the threads
             self.policy = Policy(*layouts, present, policy).to(torch_device)
         self.optimiser = make_optimiser(
             self.policy.parameters(), self.policy.critic_parameters(), present.update
@@ -95,7 +97,7 @@ class Agent:
         self.steps, self.rollbacks, self.kl_beta = 0, 0, getattr(present.update, "kl_beta", None)
         self.changes: dict[str, Any] = {}  # of the update rule's settings, made by a listener
         self.episodes = FinishedEpisodes()
-        self.fresh, self.notify = True, notify  # fresh: new episodes begin with the next rollout
+        self.fresh, self.begun, self.notify = True, False, notify  # fresh: new episodes with the next rollout
         self._update_seconds: float | None = None  # of the newest update
         self.settings = _resolved(present, self.environments, self.engine.name, threads)
         if settings is None:
@@ -148,6 +150,9 @@ class Agent:
             )
         for note in [] if self.steps else self.environments.action_layout.not_mapped():
             self.notify(note)
+        if not self.begun:
+            generators.seed(self.settings.seed, self.steps)
+            self.begun = True
         while (sizes := self._next_columns(budget, start))[1] > 0:
             before = self.steps - start
             # BLAS threads beside the engine's two only spin: its products are too small to share
@@ -311,8 +316,8 @@ class Agent:
 
         Raises ValueError, with nothing changed, when the spaces differ.
         """
-        rows = getattr(env, "num_envs", self.settings.num_envs)
-        free = dataclasses.replace(anywhere(self.settings), num_envs=rows)
+        rows = env.num_envs if is_vector_env(env) else self.settings.num_envs
+        free = anywhere(self.settings, env, num_envs=rows)
         fresh, old = _environments(env, free), self.environments
         for name in ("observation_layout", "action_layout"):
             seen, expected = getattr(fresh, name).space, getattr(old, name).space
@@ -451,16 +456,11 @@ class Reinforce(Agent):
 AGENTS: dict[str, type[Agent]] = {"ppo": PPO, "a2c": A2C, "reinforce": Reinforce}
 
 
-def anywhere(settings: TrainSettings) -> TrainSettings:
-    """The settings for another environment: who steps it is chosen again."""
-    return dataclasses.replace(settings, vector_backend="auto", num_workers=None)
-
-
 def _resolved(
     settings: TrainSettings, environments: Environments, engine: str, threads: int | None
 ) -> TrainSettings:
     """The settings with every choice that was made, as settings.json holds them."""
-    given, workers = environments.backend == "given", environments.backend == "workers"
+    given, workers = environments.backend == "given", environments.backend in ("mixed", "workers")
     return dataclasses.replace(
         settings,
         num_envs=environments.num_envs,
@@ -479,6 +479,7 @@ def _environments(env: Any, settings: TrainSettings) -> Environments:
         settings.num_envs,
         backend=backend,
         num_workers=workers,
+        env_kwargs=settings.env_kwargs,
         policy=policy,
         reading=Reading.of(settings),
     )

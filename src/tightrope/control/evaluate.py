@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
-from tightrope.control.environments import tasks
+from tightrope.control.environments import copies
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.control.spaces.structure import Reading
+from tightrope.runs import generators
 
 MAX_COPIES = 10
 SHORTEST_LIMIT = 1_000  # steps that an episode may always have
@@ -33,7 +36,20 @@ def evaluate_agent(
     than long ones. One that has not ended after ``max_steps`` counts as it stands, and its copy waits for the
     others: then all are reset. Gives ``mean_return``, ``std_return``, ``ci95`` (half width), ``mean_length``,
     ``episodes``, ``returns``, ``cut_episodes``, and where episodes tell (success.py), ``success_rate``.
+    The global generators start from ``seed``, and continue afterwards as if nothing had been drawn.
     """
+    with generators.apart(seed):
+        return _evaluated(agent, environments, episodes, seed, deterministic, max_steps)
+
+
+def _evaluated(
+    agent: Any,
+    environments: Environments,
+    episodes: int,
+    seed: int,
+    deterministic: bool,
+    max_steps: float,
+) -> dict[str, Any]:
     rows = environments.num_envs
     share = np.array([episodes // rows + (i < episodes % rows) for i in range(rows)])
     rng = None if deterministic else np.random.default_rng([seed, 3])
@@ -108,22 +124,27 @@ def cut_text(result: dict[str, Any], limit: float) -> str | None:
 
 
 def evaluation_environments(env: Any, settings: TrainSettings, episodes: int) -> Environments:
-    """Copies for evaluation, in this process: at most MAX_COPIES, apart from those that train.
+    """Copies for evaluation: at most MAX_COPIES, apart from those that train, and not in this process where
+    all of those are in workers.
 
     Raises ValueError when the environment cannot be made a second time (a vector environment, say).
     """
-    if hasattr(env, "single_observation_space"):
+    if is_vector_env(env):
         raise ValueError(
             "A vector environment cannot be copied for evaluation; pass a Gymnasium id or a factory."
         )
     source: Any = settings.env if env is None else env
-    backend = settings.vector_backend if settings.vector_backend in ("vector", "envpool") else "serial"
-    if hasattr(source, "observation_space"):  # an instance trains already: evaluation needs copies, not it
-        source = tasks.replicas(source, 2)[1]
-    return make_environments(
-        source,
-        min(episodes, MAX_COPIES),
-        backend=backend,
-        policy=policy_of(settings),
-        reading=Reading.of(settings),
-    )
+    own = ("vector", "envpool", "workers")
+    backend = settings.vector_backend if settings.vector_backend in own else "serial"
+    with generators.apart(EVALUATION_SEED):
+        if isinstance(source, gym.Env):  # an instance trains already: evaluation needs copies, not it
+            source = copies.replicator(source)
+        return make_environments(
+            source,
+            min(episodes, MAX_COPIES),
+            backend=backend,
+            num_workers=settings.num_workers,
+            env_kwargs=None if isinstance(env, gym.Env) else settings.env_kwargs,
+            policy=policy_of(settings),
+            reading=Reading.of(settings),
+        )

@@ -15,7 +15,7 @@ import numpy as np
 
 from tightrope.control.environments import tasks
 from tightrope.control.environments.masks import find_source
-from tightrope.control.settings import EVALUATION_SEED
+from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 
 if TYPE_CHECKING:
     from tightrope.control.agent import Agent
@@ -43,14 +43,16 @@ def record_run(
         raise ValueError("Writing mp4 needs imageio-ffmpeg. Install it: pip install 'tightrope[video]'.")
     from tightrope.control.saving import load
 
+    # absolute: an environment may change the working directory
+    whole, target = Path(path).absolute(), None if out is None else Path(out).absolute()
     with (
         _headless(),
         contextlib.closing(
             load(path, env=env, policy=policy, best=best, engine="torch")  # nothing is learnt
         ) as agent,
     ):
-        task = _renderable(agent.env, agent.settings.env)
-        target = Path(out) if out is not None else Path(path) / "videos" / f"step-{agent.steps:012d}.mp4"
+        task = _renderable(agent.env, agent.settings)
+        target = whole / "videos" / f"step-{agent.steps:012d}.mp4" if target is None else target
         target.parent.mkdir(parents=True, exist_ok=True)
         returns, frames = _play(agent, task, target, episodes, EVALUATION_SEED if seed is None else seed)
     return {"path": str(target), "frames": frames, "returns": returns, "step": agent.steps}
@@ -76,8 +78,9 @@ def _headless() -> Iterator[None]:
             os.environ.pop(name, None)
 
 
-def _renderable(env: Any, name: str) -> gym.Env:
+def _renderable(env: Any, settings: TrainSettings) -> gym.Env:
     """A fresh environment that renders to arrays."""
+    name, keywords = settings.env, settings.env_kwargs or {}
     if isinstance(env, str) and env.startswith("ALE/"):
         raise ValueError(
             f"{name} was trained on Atari's vector version (stacked, grey, 84 x 84), which cannot render. "
@@ -85,10 +88,10 @@ def _renderable(env: Any, name: str) -> gym.Env:
         )
     if isinstance(env, str):
         try:
-            return tasks.make_by_id(env, render_mode="rgb_array")
+            return tasks.make_by_id(env, **{**keywords, "render_mode": "rgb_array"})
         except (gym.error.Error, TypeError, ImportError) as error:
             raise _cannot(name, error) from error
-    task = env() if callable(env) and not isinstance(env, gym.Env) else env
+    task = env(**keywords) if callable(env) and not isinstance(env, gym.Env) else env
     if isinstance(task, gym.vector.VectorEnv) or getattr(task, "render_mode", None) != "rgb_array":
         raise ValueError(
             f"{name} has render_mode {getattr(task, 'render_mode', None)!r}; recording needs a single "

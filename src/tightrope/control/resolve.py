@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
     from tightrope.control.spaces.observations import ObservationLayout
 
 STEP_BYTES = 48  # of a step beside its observation and action: rewards, values, advantages, flags, twice
+# the settings that decide what the task looks like
+DESCRIBE = ("encoder", "env_kwargs", "observation_keys", "vector_backend", "env_timeout")
 
 
 def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None = None) -> TrainSettings:
@@ -30,6 +34,7 @@ def resolve_with_preset(
 ) -> tuple[TrainSettings, dict[str, Any]]:
     """The settings as `resolve` gives them, and what the task's preset would set where nothing is given."""
     from tightrope.control.environments.tasks import name_of, time_limit
+    from tightrope.control.environments.vector import is_vector_env
 
     values = dict(overrides or {})
     algorithm = values.pop("algorithm", algorithm)
@@ -37,13 +42,12 @@ def resolve_with_preset(
         raise ValueError(f"algorithm is {algorithm!r}; expected one of: {', '.join(ALGORITHM_SETTINGS)}.")
     env_id = name_of(env)
     if env_id in BY_TASK[algorithm]:
-        chosen, limit = preset(env_id, algorithm), time_limit(env)
+        chosen, limit = preset(env_id, algorithm), time_limit(env, values.get("env_kwargs"))
     else:
-        kind, limit = _describe(env, values.get("encoder", "auto"))
+        kind, limit = _describe(env, {name: values[name] for name in DESCRIBE if name in values})
         chosen = preset(env_id, algorithm, kind, limit)
-    num_envs = getattr(env, "num_envs", None)  # a vector environment has its own number of copies
-    if num_envs is not None:
-        chosen["num_envs"] = int(num_envs)
+    if is_vector_env(env):  # it has its own number of copies
+        chosen["num_envs"] = int(env.num_envs)
     merged = {"num_envs": 8, "num_steps": 256, **chosen, **values}
     sizes = (merged["num_envs"], merged["num_steps"])
     if algorithm == "ppo" and "minibatch_size" not in values and all(type(size) is int for size in sizes):
@@ -56,6 +60,17 @@ def resolve_with_preset(
     return settings, chosen
 
 
+def anywhere(settings: TrainSettings, env: Any, **values: Any) -> TrainSettings:
+    """The settings for another environment: who steps it is chosen again, and what was built with the
+    arguments of the old one is not built with them.
+    """
+    import gymnasium as gym
+
+    same = env == settings.env or (callable(env) and not isinstance(env, gym.Env))
+    kept = settings.env_kwargs if same else None
+    return dataclasses.replace(settings, vector_backend="auto", num_workers=None, env_kwargs=kept, **values)
+
+
 def _checkpoint_interval(episode: float) -> float:
     """checkpoint_every: its default, or more where an episode is a larger share of the run.
 
@@ -65,32 +80,40 @@ def _checkpoint_interval(episode: float) -> float:
     return min(1.0, max(TrainSettings.checkpoint_every or 1.0, math.ceil(1000 * episode) / 1000))
 
 
-def _describe(env: Any, encoder: str) -> tuple[str, int | None]:
+def _describe(env: Any, values: dict[str, Any]) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
-    from tightrope.control.environments.faults import close_environment
-    from tightrope.control.environments.tasks import make_all, make_vector_by_id, makers_of, time_limit
+    from tightrope.control.environments.copies import makers_of
+    from tightrope.control.environments.tasks import (
+        close_environment,
+        make_all,
+        make_vector_by_id,
+        time_limit,
+    )
+    from tightrope.control.environments.vector import is_vector_env
+    from tightrope.control.environments.watchdog import limited
     from tightrope.control.spaces.actions import action_layout
     from tightrope.control.spaces.observations import observation_layout
 
+    given = TrainSettings(**values)
     made: list[Any] = []
-    if isinstance(env, str) and env.startswith("ALE/"):
-        made.append(make_vector_by_id(env, 1))
-    elif not hasattr(env, "observation_space"):
-        make_all(makers_of(env, 1), made)
-    with contextlib.ExitStack() as stack:
-        if made:
-            stack.callback(close_environment, made[0], 0)
+    limit = functools.partial(limited, timeout=given.env_timeout)
+    with contextlib.chdir("."), contextlib.ExitStack() as stack:  # a constructor may move away
+        if isinstance(env, str) and env.startswith("ALE/") and given.vector_backend in ("auto", "vector"):
+            made.append(make_vector_by_id(env, 1, given.env_kwargs))
+        elif not is_vector_env(env):
+            make_all(makers_of(env, 1, given.env_kwargs), made, limit=limit)
+        if made and made[0] is not env:
+            stack.callback(close_environment, made[0], 0, limit)
         task = made[0] if made else env
         vector = hasattr(task, "single_observation_space")
-        observations = observation_layout(
-            task.single_observation_space if vector else task.observation_space, encoder
-        )
+        space = task.single_observation_space if vector else task.observation_space
+        observations = observation_layout(space, given.encoder, given.observation_keys)
         actions = action_layout(task.single_action_space if vector else task.action_space)
-        limit = time_limit(env if isinstance(env, str) else task)
+        steps = time_limit(env if isinstance(env, str) else task, given.env_kwargs)
     if observations.images:
-        return "images", limit
+        return "images", steps
     continuous = any(component.kind == "gaussian" for component in actions.components)  # mixed ones too
-    return ("continuous" if continuous else "discrete"), limit
+    return ("continuous" if continuous else "discrete"), steps
 
 
 def require_room(

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import shlex
 import warnings
 from pathlib import Path
 from typing import Any
 
-from tightrope.control.agent import AGENTS, Agent, anywhere
+from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.evaluate import cut_text, evaluate_agent, evaluation_environments, step_limit
+from tightrope.control.resolve import anywhere
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
@@ -50,11 +51,9 @@ def load(
         again = name_again(path, settings.env, "evaluate")
         raise ValueError(f"{again}\nIn Python: load({str(path)!r}, env=...)")
     if env is not None:
-        name, rows = (
-            env if isinstance(env, str) else settings.env,
-            getattr(env, "num_envs", settings.num_envs),
-        )
-        settings = dataclasses.replace(anywhere(settings), env=name, num_envs=rows)
+        name = env if isinstance(env, str) else settings.env
+        rows = env.num_envs if is_vector_env(env) else settings.num_envs
+        settings = anywhere(settings, env, num_envs=rows).with_values(env=name)
     agent = rebuild(settings.env if env is None else env, path, policy=policy, settings=settings)
     try:
         agent.require_spaces(state)

@@ -23,6 +23,8 @@ class TrainSettings(Settings):
     """Train a policy on a Gymnasium task."""
 
     env: str = setting("CartPole-v1", "Gymnasium id of the task.")
+    env_kwargs: dict[str, Any] | None = setting(None, "Arguments for the constructor of the task.")
+    observation_keys: tuple[str, ...] = setting((), "Of Dict observations, the keys to use; none given: all.")
     algorithm: Algorithm = setting("ppo", "The update rule.", choices=tuple(ALGORITHM_SETTINGS))
     update: UpdateSettings = of_update_rule(ALGORITHM_SETTINGS)
 
@@ -71,12 +73,12 @@ class TrainSettings(Settings):
 
     vector_backend: str = setting(
         "auto",
-        "Who steps the copies: this process, worker processes, the task's own vector version, or EnvPool.",
-        choices=("auto", "serial", "workers", "vector", "envpool"),
+        "Who steps the copies: this process, it and workers, workers, the task's vector version, EnvPool.",
+        choices=("auto", "serial", "mixed", "workers", "vector", "envpool"),
     )
     num_workers: int | None = setting(
         None,
-        "With workers: processes to spread the copies over; none: one a core, this process included.",
+        "Processes to spread the copies over; with mixed this one is one of them. none: one a core.",
         at_least=1,
         at_most=1024,
         needs={"vector_backend": ("auto", "workers")},
@@ -108,7 +110,7 @@ class TrainSettings(Settings):
     )
     env_timeout: float | None = setting(
         60.0,
-        "Seconds a step or a reset of an environment may take before it counts as hung; none: no limit.",
+        "Seconds for a step, a reset, the constructor or close of an environment; none: no limit.",
         above=0,
         at_most=1e9,
     )

@@ -40,7 +40,7 @@ def train(
     policy: Any = None,
 ) -> dict[str, Any]:
     """Train from the start; returns the summary that is also written to the run folder."""
-    report = Listeners(listeners)
+    home, report = Path.cwd(), Listeners(listeners)
     for risk in settings.risks():
         report.warn(risk)
     require_tensorboard(settings.tensorboard)
@@ -50,7 +50,7 @@ def train(
         report.warn(text)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
-    with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name) as run:
+    with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name, home) as run:
         learner = AgentLearner(agent, run, report)
         if agent.policy.own is not None or not isinstance(source, str):
             # settings.json is not enough to make these first weights again
@@ -166,7 +166,7 @@ class AgentLearner:
         if self.settings.evaluate_every is not None:
             self._open_evaluation()
         environments = self.agent.environments
-        workers = f" in {environments.num_workers} processes" if environments.backend == "workers" else ""
+        workers = f" in {environments.num_workers} processes" if environments.num_workers > 1 else ""
         count = f"{environments.num_envs} x {self.settings.env}"
         return [self.agent.engine_line, f"environments: {count}, {environments.backend}{workers}"]
 

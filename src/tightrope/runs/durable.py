@@ -90,6 +90,15 @@ def write_file(path: Path, parts: Iterable[bytes | memoryview], *, sync: bool = 
     return size, digest.hexdigest()
 
 
+def spare_standard_streams() -> None:
+    """Open what user code has closed of the descriptors 0 to 2: a file that stays open must not get their
+    numbers, and be closed or printed into by the next who means them.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+
+
 def write_all(descriptor: int, content: bytes | memoryview) -> None:
     """Write every byte: one system call may write fewer than it is given."""
     rest = memoryview(content)

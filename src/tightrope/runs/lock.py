@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.errors import TightropeError
-from tightrope.runs.durable import write_all, writing
+from tightrope.runs.durable import spare_standard_streams, write_all, writing
 
 NAME = "writer.lock"
 _HELD: weakref.WeakSet[WriterLock] = weakref.WeakSet()
@@ -42,6 +42,7 @@ class WriterLock:
         self._path = folder / NAME
         self._descriptor: int | None = None
         with writing(self._path):
+            spare_standard_streams()
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
             self._descriptor = os.open(self._path, flags, 0o644)
             try:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tightrope.runs.durable import BLOCK, replace_file, write_all, writing
+from tightrope.runs.durable import BLOCK, replace_file, spare_standard_streams, write_all, writing
 
 # The files of a run that grow. changes.jsonl: settings that a listener has changed.
 RECORDS = ("metrics.jsonl", "episodes.jsonl", "samples.jsonl", "changes.jsonl")
@@ -167,6 +167,7 @@ class Recorder:
         self.path = path
         self._descriptor = -1
         with writing(path):
+            spare_standard_streams()
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
             self._descriptor = os.open(path, flags, 0o666)
             content = path.read_bytes()

@@ -50,19 +50,23 @@ class Run:
         self._new_name = False  # a record file was created and its name is not yet durable
 
     @classmethod
-    def create(cls, run_dir: str | Path | None, settings: dict[str, Any], name: str) -> Run:
+    def create(
+        cls, run_dir: str | Path | None, settings: dict[str, Any], name: str, home: Path | None = None
+    ) -> Run:
         """A new run folder with settings.json in it.
 
-        ``run_dir`` None: ``runs/<name>-<yyyymmdd-hhmmss>``. Nothing is ever overwritten: a folder that exists
-        and is not empty raises ValueError before anything is written.
+        ``run_dir`` None: ``runs/<name>-<yyyymmdd-hhmmss>``. ``home``: where relative paths begin (None: in
+        the working directory); the path is absolute from here on, whatever user code does with the directory.
+        Nothing is ever overwritten: a folder that exists and is not empty raises ValueError before anything
+        is written.
         """
         if run_dir == "":
             raise ValueError("run_dir is empty. Give the path of a new folder, or leave it out.")
-        with writing(Path("runs") if run_dir is None else Path(run_dir)):
+        path = (Path.cwd() if home is None else home) / ("runs" if run_dir is None else run_dir)
+        with writing(path):
             if run_dir is None:
-                path = fresh(Path("runs"), re.sub(r"[^\w.-]+", "-", name))
+                path = fresh(path, re.sub(r"[^\w.-]+", "-", name))
             else:
-                path = Path(run_dir)
                 require_free(path)
                 durable.make_folders(path)
         run = cls(path, plain(settings)).lock()
@@ -82,6 +86,7 @@ class Run:
         path = Path(path)
         if not (path / "settings.json").is_file():
             raise ValueError(f"{path} is not a run folder: {why_not(path)}")
+        path = path.absolute()
         refuse_links(path)
         run = cls(path, {})
         if own:

@@ -67,14 +67,22 @@ def range_text(metadata: Mapping[str, Any]) -> str:
 
 
 class Kind(NamedTuple):
-    """The values a field takes: those of one type (tuple: whole numbers), and None where it is optional."""
+    """The values a field takes: those of one type, and None where it is optional.
+
+    ``items``: of a tuple, the type of its items. A dict has names and values that JSON can hold.
+    """
 
     type: type
     optional: bool
+    items: Any = int
 
     def __str__(self) -> str:
         """As text, for errors."""
-        name = "whole numbers in a tuple or list" if self.type is tuple else self.type.__name__
+        name = self.type.__name__
+        if self.type is dict:
+            name = "names and values that JSON can hold, in a dict"
+        elif self.type is tuple:
+            name = f"{'whole numbers' if self.items is int else 'words'} in a tuple or list"
         return f"{name} or None" if self.optional else name
 
 
@@ -87,8 +95,9 @@ def kinds(settings: type) -> dict[str, Kind]:
 
 def _kind(hint: Any) -> Kind:
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    plain = {Literal: str, tuple: tuple}.get(get_origin(options[0]), options[0])
-    return Kind(plain, NoneType in options)
+    plain = {Literal: str, tuple: tuple, dict: dict}.get(get_origin(options[0]), options[0])
+    items = get_args(options[0])[0] if plain is tuple else int
+    return Kind(plain, NoneType in options, items)
 
 
 def typed(name: str, value: Any, kind: Kind) -> Any:
@@ -98,8 +107,12 @@ def typed(name: str, value: Any, kind: Kind) -> Any:
     """
     if value is None and kind.optional:
         return None
-    if kind.type is tuple and isinstance(value, list | tuple) and all(type(x) is int for x in value):
-        return tuple(typed(name, x, Kind(int, False)) for x in value)
+    if kind.type is tuple and isinstance(value, list | tuple) and all(type(x) is kind.items for x in value):
+        return tuple(typed(name, x, Kind(kind.items, False)) for x in value)
+    if kind.type is dict and isinstance(value, dict) and not _plain(value):
+        raise ValueError(
+            f"{name} is {value!r}; expected {kind}. Give a function that builds the task with them."
+        )
     if type(value) is int and abs(value) > LARGEST_INTEGER:
         digits = str(value) if abs(value) < 10**30 else "a number of more than 30 digits"
         raise ValueError(f"{name} is {digits}; expected at most {LARGEST_INTEGER} (64 bits).")
@@ -108,6 +121,16 @@ def typed(name: str, value: Any, kind: Kind) -> Any:
     if type(value) is kind.type or dataclasses.is_dataclass(kind.type):
         return value
     raise ValueError(f"{name} is {value!r} ({type(value).__name__}); expected {kind}.")
+
+
+def _plain(value: Any) -> bool:
+    """Whether JSON can hold a value."""
+    if isinstance(value, dict):
+        return all(type(key) is str and _plain(item) for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return all(map(_plain, value))
+    finite = type(value) is not float or math.isfinite(value)
+    return value is None or (type(value) in (bool, int, float, str) and finite)
 
 
 def validate(settings: Any) -> None:

@@ -1,3 +1,3 @@
 """Copies of a task behind reset and step."""
 
-__all__ = ["base", "faults", "make", "masks", "processes", "state", "tasks"]
+__all__ = ["base", "copies", "faults", "make", "masks", "processes", "state", "tasks", "vector", "watchdog"]

@@ -35,7 +35,7 @@ class Environments(ABC):
     to choose their actions: one group is stepped while the actions of the next are chosen.
     """
 
-    backend: str  # "serial" | "workers" | "vector" | "envpool" | "given"
+    backend: str  # "serial" | "mixed" | "workers" | "vector" | "envpool" | "given"
     spec_id: str
     max_episode_steps: int | None
     num_workers: int = 1

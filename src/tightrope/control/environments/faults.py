@@ -197,18 +197,11 @@ def fault_while(doing: str, index: int, error: BaseException) -> EnvironmentFaul
     raised again.
     """
     raise_signal(error)
-    what = "".join(traceback.format_exception(error)).rstrip()
-    return EnvironmentFault(
-        f"{doing} environment {index} raised {type(error).__name__}: {error}. Mend it there.\n{what}", index
-    )
-
-
-def close_environment(env: Any, index: int) -> None:
-    """Close an environment; EnvironmentFault when its own code raises."""
-    try:
-        env.close()
-    except RAISED as error:
-        raise fault_while("Closing", index, error) from error
+    late = isinstance(error, EnvironmentTimeout)
+    what = f"was {error}" if late else f"raised {type(error).__name__}: {error}"
+    who = f"environment {index}" if index >= 0 else "the vector environment"
+    trace = "".join(traceback.format_exception(error)).rstrip()
+    return EnvironmentFault(f"{doing} {who} {what}. Mend it there.\n{trace}", index)
 
 
 def circumstances(worker: int, seed: int | None, action: str | None) -> str:

@@ -7,6 +7,7 @@ of a truncated episode is kept.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -24,7 +25,6 @@ from tightrope.control.environments.faults import (
     Restarts,
     action_text,
     check_finite,
-    close_environment,
     explained,
     kind_of,
     raise_signal,
@@ -33,10 +33,12 @@ from tightrope.control.environments.faults import (
 )
 from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, find_source
 from tightrope.control.environments.success import success_of
-from tightrope.control.environments.tasks import check_alike, make_all
+from tightrope.control.environments.tasks import check_alike, close_environment, make_all
+from tightrope.control.environments.watchdog import limited
 from tightrope.control.spaces.actions import ActionLayout, action_layout
 from tightrope.control.spaces.observations import ObservationLayout, observation_layout
 from tightrope.control.spaces.structure import MASK_KEY, Inputs, Reading, float_parts
+from tightrope.runs import generators
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +136,12 @@ class EnvGroup:
         self.name = name
         self.first = first
         self.worker = worker
+        # the main process watches its workers
+        self._limit = functools.partial(limited, timeout=None if worker else policy.timeout)
         self.makers = makers
         self.policy = policy
         self.restarts = Restarts(policy)
-        self.observation_layout = observation_layout(envs[0].observation_space, reading.encoder)
+        self.observation_layout = observation_layout(envs[0].observation_space, reading.encoder, reading.keys)
         self.action_layout = action_layout(envs[0].action_space, reading.action_bounds)
         self.has_masks = False
         self._mask_sources = [MaskSource()] * len(envs)
@@ -162,6 +166,8 @@ class EnvGroup:
         self._dirty = True
         self.buffers.masks.fill(True)
         self.buffers.cut.fill(False)
+        if self.worker:
+            generators.seed(seed, self.first)
         try:
             for row in range(len(self.envs)):
                 try:
@@ -199,7 +205,10 @@ class EnvGroup:
         """Reset one environment with its seed."""
         self._calls += 1
         self.buffers.current[0] = row
-        observation, info = _check_reset(self.envs[row].reset(seed=self._seed_of(row)))
+        seed = self._seed_of(row)
+        if len(self.envs) == 1:  # what it draws from the global generators is then its own
+            generators.seed(seed)
+        observation, info = _check_reset(self.envs[row].reset(seed=seed))
         self._plain &= isinstance(observation, np.ndarray)
         self.observation_layout.write(observation, self._rows[row])
         if self.policy.restart:
@@ -324,11 +333,11 @@ class EnvGroup:
         """Make another environment for a row; an instance that the user gave stays and is reset."""
         old = self.envs[row]
         fresh: list[gym.Env] = []
-        make_all(self.makers[row : row + 1], fresh)
+        make_all(self.makers[row : row + 1], fresh, self.first + row, self._limit)
         check_alike(fresh, self.observation_layout, self.action_layout, self.name)
         if fresh[0] is not old:
             with contextlib.suppress(EnvironmentFault):
-                close_environment(old, self.first + row)
+                close_environment(old, self.first + row, self._limit)
         self.envs[row] = fresh[0]
 
     def _seed_of(self, row: int) -> int:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 
-from tightrope.control.environments import tasks
+from tightrope.control.environments import copies, tasks
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import FaultPolicy
 from tightrope.control.environments.pool import EnvironmentPool
-from tightrope.control.environments.processes import available_cores
+from tightrope.control.environments.processes import available_cores, first_look
 from tightrope.control.environments.vector import VectorEnvironments, is_vector_env
 from tightrope.control.spaces.structure import Reading
 
-BACKENDS = ("auto", "serial", "workers", "vector", "envpool")
+BACKENDS = ("auto", "serial", "mixed", "workers", "vector", "envpool")
+# Ids from these are trusted not to end the process.
+KNOWN_MODULES = ("gymnasium.", "ale_py", "minigrid")
 # A step of these takes tens of microseconds: long enough for a worker process to save time.
 SLOW_MODULES = ("gymnasium.envs.mujoco", "gymnasium.envs.box2d")
 # Numpy: 43 us a step for any small number of environments, against about 7.5 us each one by one.
@@ -24,10 +26,17 @@ NUMPY_VECTOR_FROM = 6
 
 
 class Backend(NamedTuple):
-    """What steps the environments, and in how many processes (this one included)."""
+    """What steps the environments, and in how many processes (with "mixed" this one is one of them)."""
 
-    name: str  # "serial" | "workers" | "vector" | "envpool" | "given"
+    name: str  # "serial" | "mixed" | "workers" | "vector" | "envpool" | "given"
     num_workers: int = 1
+
+
+def look_first(env_id: str, keywords: Mapping[str, Any] | None = None) -> None:
+    """EnvironmentFault for an id of an unknown package whose environment ends its process; see
+    `first_look`."""
+    if not tasks.entry_module(tasks.find_spec(env_id)).startswith(KNOWN_MODULES):
+        first_look(env_id, lambda: tasks.make_by_id(env_id, **(keywords or {})))
 
 
 def choose_backend(
@@ -35,8 +44,9 @@ def choose_backend(
 ) -> Backend:
     """The backend that ``auto`` means. It depends only on these arguments, never on a timing.
 
-    ``env_id`` None: a factory, or an instance without a spec. Asking for more than one worker means workers.
-    Jax versions of a task are never chosen, because they must be compiled first.
+    ``env_id`` None: a factory, or an instance without a spec. Asking for workers means workers; without that,
+    this process shares in the work, because the cores would wait for it otherwise. Jax versions of a task are
+    never chosen, because they must be compiled first.
     """
     if num_workers is not None and num_workers > 1 and num_envs > 1:
         return Backend("workers", min(num_workers, num_envs))
@@ -46,7 +56,7 @@ def choose_backend(
         return Backend("vector")
     groups = min(cores, num_envs) if num_workers is None else 1
     if groups > 1 and tasks.entry_module(tasks.find_spec(env_id)).startswith(SLOW_MODULES):
-        return Backend("workers", groups)
+        return Backend("mixed", groups)
     return Backend("serial")
 
 
@@ -56,15 +66,16 @@ def make_environments(
     *,
     backend: str = "auto",
     num_workers: int | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
     policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
     reading: Reading = Reading(),  # noqa: B008
 ) -> Environments:
     """``num_envs`` environments from a Gymnasium id, an instance, a factory, or a vector environment.
 
-    ``num_envs`` None: 1, or what the vector environment has. A given instance or vector environment is
-    stepped but never closed. ``policy``: what happens after a fault. ValueError: an unknown id, a backend
-    that the task does not have, an instance that cannot be replicated, spaces that are not supported or
-    cannot be read as ``reading`` asks.
+    ``num_envs`` None: 1, or what the vector environment has. ``env_kwargs``: for the constructor. A given
+    instance or vector environment is stepped but never closed. ``policy``: what happens after a fault.
+    ValueError: an unknown id, a backend that the task does not have, an instance that cannot be replicated,
+    spaces that are not supported or cannot be read as ``reading`` asks.
     """
     if backend not in BACKENDS:
         raise ValueError(f"vector backend is {backend!r}; expected one of: {', '.join(BACKENDS)}.")
@@ -72,15 +83,29 @@ def make_environments(
         chosen = Backend("given")
         environments: Environments
         environments = _given(env, num_envs, backend, policy, reading)
+        if env_kwargs:
+            raise ValueError(
+                "env_kwargs are for an id, a class or a factory; a vector environment is made already."
+            )
     else:
         num_envs = 1 if num_envs is None else num_envs
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; expected at least 1.")
         chosen = _resolve(env, num_envs, backend, num_workers)
         if isinstance(env, str) and chosen.name in ("vector", "envpool"):
-            environments = _vector_version(env, num_envs, chosen.name, policy, reading)
+            environments = _vector_version(env, num_envs, chosen.name, env_kwargs, policy, reading)
         else:
-            environments = _pool(env, num_envs, chosen.num_workers, policy, reading)
+            makers = copies.makers_of(env, num_envs, env_kwargs)
+            environments = EnvironmentPool(
+                makers,
+                chosen.num_workers,
+                tasks.name_of(env),
+                here=chosen.name != "workers",
+                keep_first=isinstance(env, gym.Env),
+                reading=reading,
+                policy=policy,
+            )
+            environments.spec_id = env if isinstance(env, str) else environments.spec_id
     environments.backend, environments.num_workers = chosen
     return environments
 
@@ -97,8 +122,8 @@ def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> 
         return Backend(backend)
     if backend == "serial":
         return Backend("serial")
-    if backend == "workers":
-        return Backend("workers", min(num_envs, num_workers or cores))
+    if backend in ("mixed", "workers"):
+        return Backend(backend, min(num_envs, num_workers or cores))
     if isinstance(env, str):
         return choose_backend(env, num_envs, num_workers, cores)
     env_id = env.spec.id if isinstance(env, gym.Env) and env.spec else None
@@ -107,28 +132,24 @@ def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> 
     return Backend("serial") if chosen.name == "vector" else chosen
 
 
-def _pool(env: Any, num_envs: int, num_groups: int, policy: FaultPolicy, reading: Reading) -> EnvironmentPool:
-    makers, given = tasks.makers_of(env, num_envs), isinstance(env, gym.Env)
-    name = tasks.name_of(env)
-    pool = EnvironmentPool(makers, num_groups, name, keep_first=given, policy=policy, reading=reading)
-    if isinstance(env, str):
-        pool.spec_id = env
-    return pool
-
-
 def _vector_version(
-    env_id: str, num_envs: int, backend: str, policy: FaultPolicy, reading: Reading
+    env_id: str,
+    num_envs: int,
+    backend: str,
+    keywords: Mapping[str, Any] | None,
+    policy: FaultPolicy,
+    reading: Reading,
 ) -> VectorEnvironments:
     """The task's own vector version, or EnvPool's."""
     if backend == "vector":
-        make = lambda seed: tasks.make_vector_by_id(env_id, num_envs)  # noqa: E731
+        make = lambda seed: tasks.make_vector_by_id(env_id, num_envs, keywords)  # noqa: E731
         vector = make(0)
         environments = VectorEnvironments(lambda seed: vector, env_id, policy, make, reading=reading)
     else:
-        threads = min(num_envs, available_cores())
-        make = lambda seed: tasks.make_envpool(env_id, num_envs, seed, threads)  # noqa: E731
+        threads, more = min(num_envs, available_cores()), dict(keywords or {})
+        make = lambda seed: tasks.make_envpool(env_id, num_envs, seed, threads, **more)  # noqa: E731
         environments = VectorEnvironments(make, env_id, policy, make, int32_actions=True, reading=reading)
-    environments.max_episode_steps = tasks.time_limit(env_id)
+    environments.max_episode_steps = tasks.time_limit(env_id, keywords)
     return environments
 
 

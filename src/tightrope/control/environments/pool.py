@@ -1,18 +1,22 @@
-"""Single environments spread over this process and worker processes.
+"""Single environments spread over processes.
 
-With k groups this process steps the first one and k - 1 workers step the others, so no core waits. If the run
-must survive faults, this process steps none and k workers step all: when a worker dies, only its own
-environments are lost.
+With the backend ``workers`` all of them live in k worker processes: when one of them dies or hangs, only its
+own environments are lost. With ``mixed`` this process steps the first of k groups and k - 1 workers step the
+others, so that no core waits; if the run must survive faults, it is as with ``workers``. With ``serial`` this
+process steps all.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import json
 import os
+import random
 import signal
 import socket
+import sys
 import threading
 import time
 import traceback
@@ -29,7 +33,6 @@ from tightrope.control.environments.faults import (
     EnvironmentFault,
     FaultPolicy,
     action_text,
-    close_environment,
     seed_of,
     wait_before_restart,
 )
@@ -38,6 +41,7 @@ from tightrope.control.environments.processes import (
     BROKEN,
     CLOSE,
     COMMAND,
+    ENDED,
     GET_STATE,
     MASKED,
     READY,
@@ -56,21 +60,23 @@ from tightrope.control.environments.processes import (
     receive_soon,
     start_context,
 )
-from tightrope.control.environments.tasks import check_alike, make_all
-from tightrope.control.environments.watchdog import Watchdog
+from tightrope.control.environments.tasks import check_alike, close_environment, make_all
+from tightrope.control.environments.watchdog import Watchdog, limited
 from tightrope.control.spaces.actions import action_layout
 from tightrope.control.spaces.observations import observation_layout
 from tightrope.control.spaces.structure import Inputs, Reading
-from tightrope.runs import signals
+from tightrope.runs import generators, signals
 
 
 @final
 class EnvironmentPool(Environments):
-    """B single environments in ``num_groups`` processes, this one included; the number changes no bit.
+    """B single environments in ``num_groups`` processes; ``here``: this one is the first of them. Neither
+    changes a bit.
 
     ``makers``: one zero-argument function per environment; environment i is seeded with seed + i.
-    ``keep_first``: the caller closes environment 0. After a fault an environment that raised is restarted
-    where it was; when a process died or hung, all of that process are.
+    ``keep_first``: the caller closes environment 0.
+    After a fault an environment that raised is restarted where it was; when a process died or hung, all of
+    that process are.
     """
 
     def __init__(
@@ -79,6 +85,7 @@ class EnvironmentPool(Environments):
         num_groups: int,
         name: str,
         *,
+        here: bool = True,
         keep_first: bool = False,
         policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
         reading: Reading = Reading(),  # noqa: B008
@@ -94,23 +101,25 @@ class EnvironmentPool(Environments):
         self._restarts_seen = 0  # of those in the buffers, how many the counter holds
         self._under_way = False  # a reset or a step, until every worker has answered
         self._bounds = [round(k * len(makers) / num_groups) for k in range(num_groups + 1)]
-        if policy.restart and num_groups > 1:  # no environment in this process: its death would end the run
+        if not here or (policy.restart and num_groups > 1):  # its death would end the run
             self._bounds.insert(0, 0)
-        here = self._bounds[1]
-        workers_first = (slice(here, self.num_envs), slice(0, here))  # they step while this process chooses
-        self.row_groups = workers_first if 0 < here < self.num_envs else (slice(0, self.num_envs),)
+        mine = self._bounds[1]  # so many of the rows are stepped here
+        workers_first = (slice(mine, self.num_envs), slice(0, mine))  # they step while this process chooses
+        self.row_groups = workers_first if 0 < mine < self.num_envs else (slice(0, self.num_envs),)
+        self._limit = functools.partial(limited, timeout=policy.timeout)
+        self._entropy = random.getrandbits(31)  # of the workers' global generators; see generators.apart
         self._group: EnvGroup | None = None  # stepped in this process
         self._workers: list[WorkerProcess] = []
         self._watchdog: Watchdog | None = None
         envs: list[gym.Env] = []
         try:
-            make_all(makers[: here or 1], envs)
+            make_all(makers[: mine or 1], envs, limit=self._limit)
             self._describe(envs)
-            self._allocate(shared=num_groups > 1)
-            if here:
-                buffers = self._buffers.map(lambda array: array[:here])
+            self._allocate(shared=mine < self.num_envs)
+            if mine:
+                buffers = self._buffers.map(lambda array: array[:mine])
                 self._group = EnvGroup(
-                    envs, buffers, name, makers=makers[:here], policy=policy, reading=reading
+                    envs, buffers, name, makers=makers[:mine], policy=policy, reading=reading
                 )
             else:  # it was made for its spaces only
                 self._close_all(envs)
@@ -119,7 +128,7 @@ class EnvironmentPool(Environments):
                 with signals.uninterrupted():  # or nobody would end it
                     self._workers.append(self._start(number))
             for worker in self._workers:
-                worker.wait()
+                worker.wait_until_built()
         except BaseException:
             self._stop_workers()
             with contextlib.suppress(EnvironmentFault):
@@ -132,7 +141,9 @@ class EnvironmentPool(Environments):
         spec = envs[0].spec
         self.spec_id = spec.id if spec is not None else type(envs[0].unwrapped).__name__
         self.max_episode_steps = getattr(spec, "max_episode_steps", None)
-        self.observation_layout = observation_layout(envs[0].observation_space, self._reading.encoder)
+        self.observation_layout = observation_layout(
+            envs[0].observation_space, self._reading.encoder, self._reading.keys
+        )
         self.action_layout = action_layout(envs[0].action_space, self._reading.action_bounds)
         self.gives_state = states.gives_state(envs[0])
         check_alike(envs, self.observation_layout, self.action_layout, self.name)
@@ -152,11 +163,9 @@ class EnvironmentPool(Environments):
         """Start the process of group ``number``."""
         first, last = self._bounds[number : number + 2]
         spin = SPIN if len(self._bounds) - 1 <= available_cores() else 0.0
-        makers = self._makers[first:last]
-        how = (self.policy, self._reading)
-        return WorkerProcess(
-            self._context, _serve, makers, self._shared, first, number, self.name, spin, *how
-        )
+        makers, entropy = self._makers[first:last], (self._entropy, number, self.restarts)
+        more = (self.name, spin, self.policy, self._reading, entropy)
+        return WorkerProcess(self._context, _serve, makers, self._shared, first, number, *more)
 
     def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
         """See Environments."""
@@ -276,7 +285,7 @@ class EnvironmentPool(Environments):
             self._restarts_seen += rows.stop - rows.start  # one restart, however many environments
             wait_before_restart(int(buffers.restarts[rows.start]), self.policy)
             fresh = self._workers[place] = self._start(place + 1)
-            fresh.wait()
+            fresh.wait_until_built()
             fresh.send(RESET, self._seed)
             return fresh.wait()
 
@@ -327,32 +336,40 @@ class EnvironmentPool(Environments):
     # ----------------------------------------------------------------------------------------------- the end
 
     def close(self) -> None:
-        """See Environments."""
+        """See Environments; EnvironmentFault for the first that raises or hangs."""
         if self._watchdog is not None:
             self._watchdog.stop()
-        self._stop_workers()
+        # something else went wrong, or the run was asked to stop and has ten seconds: no time for their ends
+        in_order = sys.exc_info()[0] is None
+        faults = self._stop_workers(in_order=in_order)
         if self._group is not None:
             envs, self._group.envs = self._group.envs, []
             self._close_all(envs)
+        if faults:
+            raise faults[0]
 
     def _close_all(self, envs: Sequence[gym.Env]) -> None:
         """Close all; EnvironmentFault for the first that raised."""
         first: EnvironmentFault | None = None
         for index in range(self._keep, len(envs)):
             try:
-                close_environment(envs[index], index)
+                close_environment(envs[index], index, self._limit)
             except EnvironmentFault as fault:
                 first = first or fault
         if first is not None:
             raise first
 
-    def _stop_workers(self) -> None:
+    def _stop_workers(self, *, in_order: bool = False) -> list[EnvironmentFault]:
+        """End all workers; ``in_order``: wait for their environments, and return what those did wrong."""
         for worker in self._workers:
             worker.send(CLOSE)
-        deadline = time.monotonic() + 2.0  # for all of them: a run that is asked to stop has ten seconds
+        late = time.monotonic() + (self.policy.timeout or 0.0)  # for all of them, who close at the same time
+        found = [worker.last_words(late) for worker in self._workers] if in_order else []
+        deadline = time.monotonic() + 2.0  # for all of them
         for worker in self._workers:
             worker.stop(max(0.0, deadline - time.monotonic()))
         self._workers = []
+        return [fault for fault in found if fault is not None]
 
 
 # --------------------------------------------------------------------------------------- in a worker process
@@ -368,6 +385,7 @@ def _serve(
     spin: float,
     policy: FaultPolicy,
     reading: Reading,
+    entropy: tuple[int, ...],
 ) -> None:
     """What a worker does: make its environments, then execute commands until CLOSE."""
     # Ctrl-C reaches the whole process group; the main process ends its workers in order
@@ -376,8 +394,9 @@ def _serve(
     close_inherited()
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     envs: list[gym.Env] = []
+    generators.seed(*entropy)
     try:
-        make_all(makers.fn, envs, first)
+        make_all(makers.fn, envs, first, made=lambda: channel.sendall(READY))
         buffers = shared.map(SharedArray.view).map(lambda array: array[first : first + len(envs)])
         group = EnvGroup(
             envs, buffers, name, first, makers=makers.fn, policy=policy, worker=number, reading=reading
@@ -387,6 +406,9 @@ def _serve(
         channel.sendall(READY)
         while (data := _obey(channel, group, spin)) is not None:
             channel.sendall((MASKED if group.has_masks else READY) + data)
+        while envs:
+            close_environment(envs.pop(), first + len(envs))
+        channel.sendall(ENDED)
     except (ConnectionError, EOFError):
         pass  # the main process is gone
     except RAISED as error:

@@ -7,10 +7,13 @@ environments and for a fault.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
 import multiprocessing
 import os
+import select
+import signal
 import socket
 import struct
 import sys
@@ -19,20 +22,21 @@ import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from multiprocessing.context import BaseContext
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy
-from tightrope.control.spaces.structure import Reading
+from tightrope.runs.durable import spare_standard_streams
 
 COMMAND = struct.Struct("<cq")  # one of the following, and a number: a seed, or how many bytes of data follow
 RESET, STEP, GET_STATE, SET_STATE, SETTLE, CLOSE = b"r", b"s", b"g", b"p", b"t", b"c"
 LENGTH = struct.Struct("<Q")
-READY, MASKED, BROKEN = b"k", b"m", b"e"  # replies: done; done, and there are action masks; a fault follows
+# replies: done; done, and there are action masks; a fault follows; all environments are closed
+READY, MASKED, BROKEN, ENDED = b"k", b"m", b"e", b"x"
+TO_START = 60.0  # seconds at least for a worker that is not forked: it imports everything again
 SETTLED = b"t"  # follows the reply to SETTLE, and no other
-TO_BUILD = 60.0  # seconds at least to make the environments, which may import much
 SPIN = 2e-4  # seconds to poll for a message before sleeping; waking up costs about as much as a step
 
 _yield_core: Callable[[], Any] = getattr(os, "sched_yield", int)  # int() where there is nothing to call
@@ -83,20 +87,22 @@ class WorkerProcess:
         name: str,
         spin: float,
         policy: FaultPolicy,
-        reading: Reading,
+        *more: Any,
     ) -> None:
         self.first = first
         self.number = number
         self.name = name
         self._spin = spin
         self._timeout = policy.timeout
-        self._built = False
+        self._owes = False  # an answer to a command
+        self._to_build, self._forked = len(makers), context.get_start_method() == "fork"
+        spare_standard_streams()
         self._socket, theirs = socket.socketpair()
-        self._set_patience(None if policy.timeout is None else max(TO_BUILD, policy.timeout))
+        self._set_patience(policy.timeout)
         carried = CloudpickleWrapper(list(makers))  # type: ignore[arg-type]
         self._process = context.Process(  # type: ignore[attr-defined]
             target=serve,
-            args=(theirs, carried, shared, first, number, name, spin, policy, reading),
+            args=(theirs, carried, shared, first, number, name, spin, policy, *more),
             daemon=True,
             name=f"tightrope-worker-{first}",
         )
@@ -120,6 +126,7 @@ class WorkerProcess:
 
     def send(self, command: bytes, number: int = 0, data: bytes = b"") -> None:
         """Wake the worker; `wait` finds out if it is gone."""
+        self._owes |= command != CLOSE
         with contextlib.suppress(OSError):
             self._socket.sendall(COMMAND.pack(command, number) + data)
 
@@ -140,9 +147,7 @@ class WorkerProcess:
             raise self._lost("has died") from error
         if reply not in (READY, MASKED):
             raise self._lost("has died")
-        if not self._built:
-            self._built = True
-            self._set_patience(self._timeout)
+        self._owes = False
         return reply == MASKED
 
     def settle(self) -> None:
@@ -151,6 +156,44 @@ class WorkerProcess:
         self.wait()
         while receive_soon(self._socket, 1, self._spin) not in (SETTLED, b""):
             pass
+
+    def wait_until_built(self) -> None:
+        """Wait until its environments are made, each within the time limit. EnvironmentFault as `wait`."""
+        if self._timeout is not None and not self._forked:
+            self._set_patience(max(TO_START, self._timeout))
+        for index in range(self.first, self.first + self._to_build):
+            try:
+                self.wait()
+            except EnvironmentFault as fault:
+                if not fault.lost:
+                    raise
+                message = f"{fault} It was making environment {index}."
+                raise dataclasses.replace(fault, message=message, index=index) from fault.__cause__
+            self._set_patience(self._timeout)
+        self.wait()
+
+    def last_words(self, deadline: float) -> EnvironmentFault | None:
+        """After CLOSE: what went wrong while its environments were closed, None if nothing did.
+
+        One that still owes an answer is not waited for: it hangs, or has been left in the middle of a step.
+        """
+        if self._owes:
+            return None
+        try:
+            self._set_patience(None if self._timeout is None else max(0.1, deadline - time.monotonic()))
+            reply = receive_soon(self._socket, 1, 0.0)
+            return EnvironmentFault(**self._receive_json()) if reply == BROKEN else None
+        except (TimeoutError, BlockingIOError):
+            self._process.kill()
+            return EnvironmentFault(
+                f"Closing the environments of worker {self.number} of {self.name} was not back after "
+                f"{self._timeout:g} s (env_timeout). Mend close() there.",
+                self.first,
+                env_id=self.name,
+                worker=self.number,
+            )
+        except (OSError, EnvironmentFault):  # it was gone before
+            return None
 
     def states(self) -> Any:
         """The packed states that follow the reply to GET_STATE. EnvironmentFault as `wait`."""
@@ -197,6 +240,66 @@ class WorkerProcess:
             self._process.join()
         self._socket.close()
         self._process.close()
+
+
+def first_look(name: str, make: Callable[[], Any], seconds: float = 1.0) -> None:
+    """Make, reset and step an environment in a forked child, for at most ``seconds``.
+
+    EnvironmentFault when it ends the process, which would be this one next. What it raises is left to the
+    caller, who will meet it. Without effect where processes are not forked (see `start_context`).
+    """
+    if sys.platform != "linux":
+        return
+    read, write = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", DeprecationWarning
+        )  # of fork beside threads: the child is short-lived
+        child = os.fork()
+    if not child:
+        _look(make, write)
+    os.close(write)
+    status, give_up = None, time.monotonic() + seconds
+    with open(read, "rb", buffering=0) as answer:
+        while status is None and not select.select([answer], [], [], 0.01)[0] and time.monotonic() < give_up:
+            ended, found = os.waitpid(child, os.WNOHANG)
+            status = found if ended else None
+        whole = bool(select.select([answer], [], [], 0)[0]) and bool(answer.read(1))
+    late = time.monotonic() >= give_up
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(child, signal.SIGKILL)  # and what it has started
+    if status is None:
+        status = os.waitpid(child, 0)[1]
+    if not whole and not late:
+        code = os.waitstatus_to_exitcode(status)
+        how = f"with exit code {code}" if code >= 0 else f"by {signal.Signals(-code).name}"
+        raise EnvironmentFault(
+            f"{name} ended its process {how} while it was made, reset or in its first steps (seen in a child "
+            "process). Mend the environment, or make what it calls raise an exception instead.",
+            0,
+            env_id=name,
+        )
+
+
+def _look(make: Callable[[], Any], write: int) -> NoReturn:
+    """In the child: a few random steps; an answer through ``write`` when the environment let this process
+    live."""
+    os.setsid()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for descriptor in range(3):  # the run itself will print what there is to say
+        os.dup2(nowhere, descriptor)
+    with contextlib.suppress(BaseException):
+        env = make()
+        env.reset(seed=0)
+        for _ in range(10):
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            if terminated or truncated:
+                env.reset()
+        env.close()
+    os.write(write, b"k")
+    os._exit(0)
 
 
 def pack_json(value: Any) -> bytes:

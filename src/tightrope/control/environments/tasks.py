@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import difflib
 import functools
 import importlib
 import importlib.util
+import inspect
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 
-from tightrope.control.environments.faults import RAISED, fault_while, raised_here
+from tightrope.control.environments.faults import RAISED, EnvironmentTimeout, fault_while, raised_here
 from tightrope.control.spaces.actions import ActionLayout
 from tightrope.control.spaces.observations import ObservationLayout
-from tightrope.control.spaces.structure import bounds_of, structure
+from tightrope.control.spaces.structure import bounds_of, selected, structure
 
 # namespace or entry point module -> the module that must be there, and our extra that installs it
 EXTRAS = {
@@ -26,6 +26,7 @@ EXTRAS = {
     "gymnasium.envs.mujoco": ("mujoco", "mujoco"),
     "ale_py": ("ale_py", "atari"),
 }
+Limit = Callable[[str], contextlib.AbstractContextManager[Any]]
 # Warnings of third parties while a standard task is built; a user can do nothing about them.
 NOISE = (
     r".*precision lowered by casting.*",
@@ -33,8 +34,6 @@ NOISE = (
     r".*settotalmass.*",
     r"builtin type [Ss]wig\w* has no __module__ attribute",
 )
-# wrappers that gym.make adds or not, without effect on a task
-BOOKKEEPING = ("OrderEnforcing", "PassiveEnvChecker")
 
 
 def find_spec(env_id: str) -> EnvSpec | None:
@@ -51,8 +50,13 @@ def name_of(env: Any) -> str:
     return str(known or type(getattr(env, "unwrapped", env)).__name__)
 
 
-def time_limit(env: Any) -> int | None:
-    """The steps after which an id or an environment object truncates an episode; None: none, or unknown."""
+def time_limit(env: Any, keywords: Mapping[str, Any] | None = None) -> int | None:
+    """The steps after which an id or an environment object truncates an episode; None: none, or unknown.
+
+    ``keywords``: for gym.make, which takes another limit.
+    """
+    if keywords and "max_episode_steps" in keywords:
+        return keywords["max_episode_steps"]
     spec = find_spec(env) if isinstance(env, str) else getattr(env, "spec", None)
     return getattr(spec, "max_episode_steps", None)
 
@@ -106,7 +110,7 @@ def make_by_id(env_id: str, **keywords: Any) -> gym.Env:
     return _explained(env_id, lambda: gym.make(env_id, disable_env_checker=True, **keywords))
 
 
-def make_vector_by_id(env_id: str, num_envs: int) -> Any:
+def make_vector_by_id(env_id: str, num_envs: int, keywords: Mapping[str, Any] | None = None) -> Any:
     """The task's own vector version, resetting in the same step where it can; ValueError without one."""
     spec = find_spec(env_id)
     if spec is None:
@@ -117,9 +121,13 @@ def make_vector_by_id(env_id: str, num_envs: int) -> Any:
             f"vector backend 'vector' asked for, but {env_id} has no vector version of its own. "
             "Use auto, serial or workers."
         )
+    keywords = dict(keywords or {})
+    require_keywords(env_id, keywords, vector=True)
 
     def make() -> Any:
-        make_vec = functools.partial(gym.make_vec, env_id, num_envs, vectorization_mode="vector_entry_point")
+        make_vec = functools.partial(
+            gym.make_vec, env_id, num_envs, vectorization_mode="vector_entry_point", **keywords
+        )
         same_step: dict[str, Any] = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
         if env_id.startswith("ALE/"):
             same_step["reward_clipping"] = False  # returns are reported in the points of the game
@@ -148,7 +156,7 @@ def _trusting(env: Any) -> Any:
     return env
 
 
-def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int) -> Any:
+def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int, **keywords: Any) -> Any:
     """EnvPool's version of a task; ValueError when EnvPool is missing or does not know the id."""
     try:
         import envpool
@@ -164,7 +172,61 @@ def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int) -> Any
             f"EnvPool has no task {name!r}.{_did_you_mean(name, known)} Or use another vector backend."
         )
     with without_noise():
-        return envpool.make(name, env_type="gymnasium", num_envs=num_envs, seed=seed, num_threads=num_threads)
+        sizes = {"num_envs": num_envs, "num_threads": num_threads}
+        return envpool.make(name, env_type="gymnasium", seed=seed, **sizes, **keywords)
+
+
+def require_keywords(env: Any, keywords: Mapping[str, Any], *, vector: bool = False) -> None:
+    """ValueError for a keyword that the constructor of an id, a class or a factory does not take; it lists
+    those that it takes. ``vector``: of the id's vector version. Without effect where the signature cannot be
+    known.
+    """
+    if not keywords:
+        return
+    spec, maker, extra = None, env, {}
+    if isinstance(env, str):
+        spec = _explained(env, lambda: gym.spec(env))
+        point = spec.vector_entry_point if vector else spec.entry_point
+        maker = _explained(env, lambda: load_env_creator(point) if isinstance(point, str) else point)
+        extra = {} if vector else {"max_episode_steps": spec.max_episode_steps}
+    taken = _taken(maker)
+    for name in keywords:
+        if taken is None or name in taken or name in extra:
+            continue
+        near = difflib.get_close_matches(name, [*taken, *extra], n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        defaults = {**taken, **extra, **(spec.kwargs if spec is not None else {})}
+        known = ", ".join(f"{key}={defaults[key]!r}" for key in [*taken, *extra]) or "no arguments"
+        what = f"the vector version of {env}" if vector else name_of(env)
+        other = " The single version may take others: --vector-backend serial." if vector else ""
+        raise ValueError(f"env_kwargs: {what} does not take {name!r}.{hint} It takes {known}.{other}")
+
+
+def _taken(maker: Any) -> dict[str, Any] | None:
+    """The arguments that can be given by name, and their defaults; None where some cannot be known.
+
+    ``**kwargs`` of a constructor are looked up in that of the class it inherits from.
+    """
+    functions = [maker]
+    if isinstance(maker, type):
+        functions = [
+            vars(kind)["__init__"]
+            for kind in maker.__mro__
+            if "__init__" in vars(kind) and kind is not object
+        ]
+    found: dict[str, Any] = {}
+    for function in functions:
+        try:
+            parameters = list(inspect.signature(function).parameters.values())
+        except (TypeError, ValueError):
+            return None
+        parameters = parameters[1:] if isinstance(maker, type) else parameters
+        for parameter in parameters:
+            if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
+                found.setdefault(parameter.name, parameter.default)
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            return {name: Ellipsis if d is inspect.Parameter.empty else d for name, d in found.items()}
+    return None if functions else {}
 
 
 def _explained(env_id: str, make: Callable[[], Any]) -> Any:
@@ -210,33 +272,28 @@ def _did_you_mean(name: str, known: Any) -> str:
     return f" Did you mean {' or '.join(names)}?" if names else ""
 
 
-def makers_of(env: Any, num_envs: int) -> list[Callable[[], gym.Env]]:
-    """One function per copy of an id, an instance (it is copy 0 itself) or a factory. ValueError: neither."""
-    if isinstance(env, str):
-        return [lambda: make_by_id(env)] * num_envs
-    if isinstance(env, gym.Env):
-        return replicas(env, num_envs)
-    if callable(env):
-        return [env] * num_envs
-    raise ValueError(
-        f"env is a {type(env).__name__}; expected a Gymnasium id, an environment, a zero-argument "
-        "factory or a vector environment."
-    )
-
-
-def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env], first: int = 0) -> None:
+def make_all(
+    makers: Sequence[Callable[[], gym.Env]],
+    envs: list[gym.Env],
+    first: int = 0,
+    limit: Limit = contextlib.nullcontext,
+    made: Callable[[], None] = lambda: None,
+) -> None:
     """Append one environment per maker to ``envs``; ``first``: the number of the first in the run.
 
+    ``limit``: a context, by the name of the call inside, that limits its time. ``made`` is called after each.
     ValueError when a maker returns something else, or the same object twice. EnvironmentFault when the
-    environment's own code raises.
+    environment's own code raises or hangs.
     """
     for maker in makers:
+        index = first + len(envs)
         try:
-            env = maker()
+            with limit(f"The constructor of environment {index}"):
+                env = maker()
         except RAISED as error:
-            if raised_here(error):
+            if raised_here(error) and not isinstance(error, EnvironmentTimeout):
                 raise
-            raise fault_while("Making", first + len(envs), error) from error
+            raise fault_while("Making", index, error) from error
         if not isinstance(env, gym.Env):
             raise ValueError(f"the factory returned a {type(env).__name__}; expected a gymnasium.Env.")
         if any(env is other for other in envs):
@@ -244,6 +301,17 @@ def make_all(makers: Sequence[Callable[[], gym.Env]], envs: list[gym.Env], first
                 f"the factory returned the same object twice ({env}); each call must build a new environment."
             )
         envs.append(env)
+        made()
+
+
+def close_environment(env: Any, index: int, limit: Limit = contextlib.nullcontext) -> None:
+    """Close an environment; EnvironmentFault when its own code raises or hangs. ``limit``: as in
+    `make_all`."""
+    try:
+        with limit(f"close() of environment {index}"):
+            env.close()
+    except RAISED as error:
+        raise fault_while("Closing", index, error) from error
 
 
 def check_alike(
@@ -251,64 +319,11 @@ def check_alike(
 ) -> None:
     """ValueError when the copies' observations or actions differ in shape, or the bounds of actions."""
     for env in envs:
-        pairs = ((observations.space, env.observation_space), (actions.space, env.action_space))
+        seen = selected(env.observation_space, observations.keys)
+        pairs = ((observations.space, seen), (actions.space, env.action_space))
         same = all(structure(ours) == structure(theirs) for ours, theirs in pairs)
         if not same or bounds_of(env.action_space) != bounds_of(actions.space):
             raise ValueError(
                 f"the copies of {name} differ: {env.observation_space}, {env.action_space} against "
                 f"{observations.space}, {actions.space}. All copies must have the same spaces."
             )
-
-
-def replicas(env: gym.Env, num_envs: int) -> list[Callable[[], gym.Env]]:
-    """One maker per copy of a given instance; the instance itself is copy 0.
-
-    Copies come from ``gym.make(env.spec)`` when that rebuilds the same wrappers, else from ``copy.deepcopy``.
-    ValueError: neither works.
-    """
-    makers: list[Callable[[], gym.Env]] = [lambda: env]
-    if num_envs == 1:
-        return makers
-    return makers + [_replicator(env)] * (num_envs - 1)
-
-
-def _replicator(env: gym.Env) -> Callable[[], gym.Env]:
-    reasons = []
-    for what, function in (("gym.make of its spec", _from_spec), ("copy.deepcopy", copy.deepcopy)):
-        try:
-            trial = function(env)
-        except Exception as error:
-            reasons.append(f"{what}: {type(error).__name__}: {error}")
-            continue
-        if trial is env or trial.unwrapped is env.unwrapped:
-            reasons.append(f"{what} returned the same object")
-            continue
-        if function is _from_spec:
-            trial.close()  # of a deep copy, close() might end what it shares with the original
-        return lambda: function(env)
-    raise ValueError(
-        f"the environment {env} cannot be replicated ({'; '.join(reasons)}). "
-        "Pass a zero-argument factory that builds it, or num_envs=1."
-    )
-
-
-def _from_spec(env: gym.Env) -> gym.Env:
-    spec = env.spec
-    if spec is None:
-        raise ValueError("it has no spec")
-    with without_noise(spec):
-        twin = gym.make(spec, disable_env_checker=True)
-    if _layers(twin) != _layers(env):
-        twin.close()
-        raise ValueError(f"gives {_layers(twin)}, the instance is {_layers(env)}")
-    return twin
-
-
-def _layers(env: gym.Env) -> list[str]:
-    """The classes from the outermost wrapper to the task, bookkeeping left out."""
-    names = []
-    while True:
-        names.append(f"{type(env).__module__}.{type(env).__qualname__}")
-        if not isinstance(env, gym.Wrapper):
-            return [name for name in names if name.rpartition(".")[2] not in BOOKKEEPING]
-        env = env.env

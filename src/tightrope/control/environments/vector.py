@@ -11,6 +11,7 @@ id and EnvPool's can be; one that the user gave as an object cannot, and its fau
 from __future__ import annotations
 
 import contextlib
+import functools
 import warnings
 from collections.abc import Callable
 from typing import Any, final
@@ -28,7 +29,6 @@ from tightrope.control.environments.faults import (
     FaultPolicy,
     action_text,
     check_finite,
-    close_environment,
     explained,
     kind_of,
     restart_seed,
@@ -36,7 +36,8 @@ from tightrope.control.environments.faults import (
 )
 from tightrope.control.environments.masks import find_source, vector_masks
 from tightrope.control.environments.success import SUCCESS_KEY, vector_success
-from tightrope.control.environments.watchdog import Watchdog
+from tightrope.control.environments.tasks import close_environment
+from tightrope.control.environments.watchdog import Watchdog, limited
 from tightrope.control.spaces.actions import action_layout
 from tightrope.control.spaces.observations import observation_layout
 from tightrope.control.spaces.structure import Inputs, Reading, float_parts
@@ -102,7 +103,9 @@ class VectorEnvironments(Environments):
         self._keep = keep
         self._int32 = int32_actions
         self._use(make(0))
-        self.observation_layout = observation_layout(self._env.single_observation_space, reading.encoder)
+        self.observation_layout = observation_layout(
+            self._env.single_observation_space, reading.encoder, reading.keys
+        )
         self.action_layout = action_layout(self._env.single_action_space, reading.action_bounds)
         self.gives_state = states.gives_state(self._env)
         self.row_groups = (slice(0, self.num_envs),)  # they are stepped together
@@ -371,9 +374,9 @@ class VectorEnvironments(Environments):
         self._close_env()
 
     def _close_env(self) -> None:
-        if self._env is not None and not self._keep:
-            close_environment(self._env, 0)
-        self._env = None
+        env, self._env = self._env, None
+        if env is not None and not self._keep:
+            close_environment(env, -1, functools.partial(limited, timeout=self.policy.timeout))
 
 
 def _any(flags: np.ndarray) -> bool:

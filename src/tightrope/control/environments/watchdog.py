@@ -8,12 +8,13 @@ from inside its process; then a line on stderr names it. Worker processes have t
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from tightrope.control.environments.faults import EnvironmentTimeout
@@ -93,6 +94,32 @@ class Watchdog:
         late, self._late = self._late, None
         if late is not None and late == self._now():
             raise EnvironmentTimeout(f"not back after {self._timeout:g} s (env_timeout)")
+
+
+class _Call:
+    """One call that is under way; its number is None once it is over."""
+
+    number: int | None = 1
+
+    def under_way(self) -> int | None:
+        return self.number
+
+
+@contextlib.contextmanager
+def limited(name: str, timeout: float | None) -> Iterator[None]:
+    """Raise EnvironmentTimeout in what runs inside, if it takes longer than ``timeout`` seconds (None:
+    never)."""
+    if timeout is None:
+        yield
+        return
+    call = _Call()
+    watchdog = Watchdog(call.under_way, timeout, name)
+    watchdog.start()
+    try:
+        yield
+    finally:
+        call.number = None
+        watchdog.stop()
 
 
 def _interrupt(number: int, frame: Any) -> None:

@@ -22,6 +22,7 @@ from tightrope.control.spaces.structure import (
     follow,
     nest,
     place_of,
+    selected,
     useful_bounds,
     walk,
 )
@@ -111,6 +112,7 @@ class ObservationLayout:
     one_hot: tuple[slice, ...]  # columns of each one-hot group
     has_mask: bool  # the Dict carries the action mask under "action_mask"; it is no input
     plain: bool  # one Box of rank 1: "flat" is the observation itself
+    keys: tuple[str, ...] = ()  # of a Dict, those that are used; empty: all
 
     def allocate(self, num: int, zeros: Callable[..., np.ndarray] = np.zeros) -> Inputs:
         """Empty inputs for ``num`` observations; ``zeros(shape, dtype)`` makes the arrays."""
@@ -198,11 +200,14 @@ class ObservationLayout:
         return nest(self.space, iter(parts), skip_mask=self.has_mask)
 
 
-def observation_layout(space: Space, encoder: str = "auto") -> ObservationLayout:
-    """The layout of an observation space; ``encoder``: what is an image (see `is_image`).
+def observation_layout(space: Space, encoder: str = "auto", keys: tuple[str, ...] = ()) -> ObservationLayout:
+    """The layout of an observation space; ``encoder``: what is an image (see `is_image`). ``keys``: of a
+    Dict, those that are used (empty: all).
 
-    ValueError names a space that is not supported, or in which ``cnn`` finds no image.
+    ValueError names a space that is not supported, a key that is not there, or in which ``cnn`` finds no
+    image.
     """
+    space = selected(space, keys)
     mask_space = space.spaces.get(MASK_KEY) if isinstance(space, spaces.Dict) else None
     has_mask = isinstance(mask_space, spaces.Box | spaces.MultiBinary)
     leaves: list[Leaf] = []
@@ -245,6 +250,7 @@ def observation_layout(space: Space, encoder: str = "auto") -> ObservationLayout
             for last, count in zip(np.cumsum(leaf.counts), leaf.counts, strict=True)
         ),
         has_mask=has_mask,
+        keys=keys,
         plain=len(leaves) == 1
         and leaves[0].path == ()
         and leaves[0].kind == "box"

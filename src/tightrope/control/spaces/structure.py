@@ -20,15 +20,17 @@ BOUND_LIMIT = 1e6  # bounds from here on stand for "no bound": nobody means to u
 
 
 class Reading(NamedTuple):
-    """How the spaces of a task are read: the settings ``encoder`` and ``action_bounds``."""
+    """How the spaces of a task are read: the settings ``encoder``, ``action_bounds`` and
+    ``observation_keys``."""
 
     encoder: str = "auto"
     action_bounds: str = "map"
+    keys: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, settings: Any) -> Reading:
         """As a run's settings ask for."""
-        return cls(settings.encoder, settings.action_bounds)
+        return cls(settings.encoder, settings.action_bounds, settings.observation_keys)
 
 
 def walk(space: Space, what: str, path: Path = ()) -> Iterator[tuple[Path, Space]]:
@@ -46,6 +48,35 @@ def walk(space: Space, what: str, path: Path = ()) -> Iterator[tuple[Path, Space
             f"the {what} space{place_of(path)} is {space!r}; supported are {SUPPORTED}. "
             "Wrap the environment so that it offers one of these."
         )
+
+
+def selected(space: Space, keys: tuple[str, ...]) -> Space:
+    """The space as it is, or of a Dict these keys and the action mask. ValueError: a key that is not there,
+    or without keys a part that is not supported; it names the keys that are.
+    """
+    inside = space.spaces if isinstance(space, spaces.Dict) else {}
+    if missing := [key for key in keys if key not in inside]:
+        raise ValueError(
+            f"observation_keys has {missing[0]!r}, expected some of: {', '.join(inside)}. The observation "
+            f"space is {space!r}."
+        )
+    if keys:
+        return spaces.Dict({key: part for key, part in inside.items() if key in (*keys, MASK_KEY)})
+    try:
+        list(walk(space, "observation"))
+    except ValueError as error:
+        good = [key for key, part in inside.items() if supported(part)]
+        hint = f" Or use only what can be read: --observation-keys {' '.join(good)}" if good else ""
+        raise ValueError(f"{error}{hint}") from None
+    return space
+
+
+def supported(space: Space) -> bool:
+    """Whether every basic space inside is one that has an encoding."""
+    try:
+        return bool(list(walk(space, "given")))
+    except ValueError:
+        return False
 
 
 def place_of(path: Path) -> str:
