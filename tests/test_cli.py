@@ -192,7 +192,7 @@ def test_help_says_where_a_preset_decides() -> None:
     """The default shown of such a setting would hold for no task, or only for tasks without a preset."""
     shown = {action.dest: action.help or "" for action in options.training_parser("train")._actions}
     for name, default in (
-        ("normalise_rewards", "preset"), ("entropy_weight", "preset"), ("gamma", "0.99, or preset"),
+        ("normalise_observations", "preset"), ("entropy_weight", "preset"), ("gamma", "0.99, or preset"),
         ("learning_rate", "0.0003, or preset"), ("total_steps", "100000, or preset"),
         ("clip_schedule", "constant"), ("evaluate_every", "0.05"),
     ):  # fmt: skip
