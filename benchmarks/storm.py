@@ -1,6 +1,6 @@
 """Kill storms: a run that is repeatedly killed and resumed ends like an uninterrupted one.
 
-    python benchmarks/storm.py --kills 50 --stories cartpole pendulum
+    python benchmarks/storm.py --kills 75 --stories pendulum workers vector minigrid
     python benchmarks/storm.py --kills 25 --stories language
     python benchmarks/storm.py --cost
 
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import importlib.util
 import json
 import os
 import random
@@ -42,18 +43,19 @@ CLOCKS = ("seconds", "wall_seconds")
 # ------------------------------------------------------------------------------------- the runs
 
 
-def control(env: str, **values: Any) -> Callable[[Path, Any], None]:
-    """A small run on a Gymnasium task, started, or resumed if it exists."""
+def control(env: Any, **values: Any) -> Callable[[Path, Any], None]:
+    """A small run on a Gymnasium task or a factory, started, or resumed if it exists."""
     common = {"num_envs": 4, "num_steps": 64, "seed": 1, "evaluation_episodes": 2, "threads": 1}
 
     def run(folder: Path, report: Any) -> None:
         from tightrope.control.resolve import resolve
         from tightrope.control.train import resume, train
 
+        given = {"listeners": [report], "env": None if isinstance(env, str) else env}
         if (folder / "settings.json").exists():
-            resume(folder, listeners=[report])
+            resume(folder, **given)
         else:
-            train(resolve(env, "ppo", {**common, **values}), run_dir=folder, listeners=[report])
+            train(resolve(env, "ppo", {**common, **values}), run_dir=folder, **given)
 
     return run
 
@@ -103,13 +105,75 @@ def tiny_llama(folder: Path) -> str:
     return str(folder)
 
 
+def minigrid() -> Any:
+    """Doors and keys, seen as a vector; needs the package minigrid."""
+    import gymnasium
+    import minigrid.wrappers
+
+    env = gymnasium.make("MiniGrid-DoorKey-5x5-v0")
+    return gymnasium.wrappers.FlattenObservation(minigrid.wrappers.ImgObsWrapper(env))
+
+
+def normalised() -> Any:
+    """A task whose wrappers keep statistics over all episodes."""
+    import gymnasium
+
+    env = gymnasium.wrappers.NormalizeObservation(gymnasium.make("Pendulum-v1"))
+    return gymnasium.wrappers.NormalizeReward(env)
+
+
+def pictures() -> Any:
+    """CartPole as an image: a bright column where the cart is, another where the pole points."""
+    import gymnasium
+    import numpy as np
+
+    def draw(observation: Any) -> Any:
+        image = np.zeros((1, 36, 36), np.uint8)
+        image[0, :18, int(np.clip(observation[2] * 60 + 18, 0, 35))] = 255
+        image[0, 18:, int(np.clip(observation[0] * 7 + 18, 0, 35))] = 255
+        return image
+
+    space = gymnasium.spaces.Box(0, 255, (1, 36, 36), np.uint8)
+    return gymnasium.wrappers.TransformObservation(gymnasium.make("CartPole-v1"), draw, space)
+
+
+def masked() -> Any:
+    """FrozenLake on its slippery ice, where the way back is forbidden."""
+    import gymnasium
+    import numpy as np
+
+    class Masked(gymnasium.Wrapper):
+        def reset(self, **keywords: Any) -> Any:
+            observation, info = self.env.reset(**keywords)
+            return observation, {**info, "action_mask": np.ones(4, np.int8)}
+
+        def step(self, action: Any) -> Any:
+            observation, *rest, info = self.env.step(action)
+            mask = np.arange(4) != (int(action) + 2) % 4
+            return observation, *rest, {**info, "action_mask": mask.astype(np.int8)}
+
+    return Masked(gymnasium.make("FrozenLake-v1"))
+
+
 BASE = {"minibatch_size": 128, "num_epochs": 2, "checkpoint_every": 0.1, "evaluate_every": 0.15}
 NORMALISED = {"normalise_observations": True, "normalise_rewards": True}
 STORIES: dict[str, Callable[[Path, Any], None]] = {
     "cartpole": control("CartPole-v1", total_steps=8192, **BASE),
     "pendulum": control("Pendulum-v1", total_steps=8192, **BASE, **NORMALISED),
+    "workers": control("Pendulum-v1", total_steps=8192, vector_backend="workers", num_workers=2, **BASE),
+    "vector": control("CartPole-v1", total_steps=8192, vector_backend="vector", **BASE),
+    "gsde": control("Pendulum-v1", total_steps=8192, std="gsde", gsde_steps=7, **BASE),
+    "halfcheetah": control(
+        "HalfCheetah-v5", total_steps=8192, vector_backend="workers", num_workers=2, **BASE
+    ),
+    "bipedal": control("BipedalWalker-v3", total_steps=8192, vector_backend="serial", **BASE, **NORMALISED),
+    "masks": control(masked, total_steps=8192, **BASE),
+    "wrappers": control(normalised, total_steps=8192, **BASE),
+    "cnn": control(pictures, total_steps=2048, **{**BASE, "num_steps": 32, "minibatch_size": 64}),
+    "minigrid": control(minigrid, total_steps=8192, **BASE),
     "language": language,
 }
+NEEDS = {"halfcheetah": "mujoco", "bipedal": "Box2D", "minigrid": "minigrid"}  # left out without the package
 
 
 # ------------------------------------------------------------------------------------- processes
@@ -271,6 +335,8 @@ def left(folder: Path) -> dict[str, Any]:
     found["state"] = hashlib.sha256(json.dumps(state, sort_keys=True).encode()).hexdigest()
     rows = {}
     for path in sorted(folder.glob("*.jsonl")):
+        if path.name == "actions.jsonl":  # it grows by checkpoints; what it is for shows in the rest
+            continue
         rows[path.name] = [without_clocks(json.loads(line)) for line in path.read_text().splitlines()]
     return {"checkpoint": last.name, "sha256": found, "rows": rows}
 
@@ -295,36 +361,32 @@ def compare(story: str, wanted: dict[str, Any], found: dict[str, Any]) -> None:
             )
 
 
-# ------------------------------------------------------------------------------------- what the grid costs
+# ------------------------------------------------------------------------------------- what a save costs
 
 
 def cost(base: Path, steps: int) -> dict[str, Any]:
-    """Seconds of a grid point of CartPole-v1 at default settings: save, sync, and restarted environments."""
+    """Seconds of a checkpoint of CartPole-v1 at default settings: save and sync."""
     from tightrope.control import train
     from tightrope.control.resolve import resolve
-    from tightrope.control.rollout.collector import Collector
+    from tightrope.runs.run import Run
 
-    spent = {"save": [], "reset": []}
+    spent: list[float] = []
+    save = Run.save
 
-    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **more: Any) -> Any:
-            begin = time.perf_counter()
-            found = function(*arguments, **more)
-            spent[name].append(time.perf_counter() - begin)
-            return found
+    def timed(*arguments: Any, **more: Any) -> None:
+        begin = time.perf_counter()
+        save(*arguments, **more)
+        spent.append(time.perf_counter() - begin)
 
-        return call
-
-    train._save, Collector.reset = timed("save", train._save), timed("reset", Collector.reset)
+    Run.save = timed  # type: ignore[method-assign]
     settings = resolve("CartPole-v1", "ppo", {"total_steps": steps, "seed": 1, "evaluate_every": None})
     begin = time.perf_counter()
     train.train(settings, run_dir=base / "cost")
     wall = time.perf_counter() - begin
-    point = sum(spent["save"]) / len(spent["save"]) + sum(spent["reset"]) / len(spent["reset"])
+    point = sum(spent) / len(spent)
     return {
-        "steps": steps, "wall_seconds": round(wall, 2), "points": len(spent["save"]),
-        "seconds_a_point": round(point, 5),
-        "share_of_this_run": round(sum(map(sum, spent.values())) / wall, 5),
+        "steps": steps, "wall_seconds": round(wall, 2), "points": len(spent),
+        "seconds_a_point": round(point, 5), "share_of_this_run": round(sum(spent) / wall, 5),
         "share_of_ten_minutes": round(20 * point / 600, 6),
     }  # fmt: skip
 
@@ -332,11 +394,12 @@ def cost(base: Path, steps: int) -> dict[str, Any]:
 def main(words: list[str] | None = None) -> int:
     """Run the requested storms and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--stories", nargs="+", choices=[*STORIES], default=[*STORIES])
+    here = [name for name in STORIES if name not in NEEDS or importlib.util.find_spec(NEEDS[name])]
+    parser.add_argument("--stories", nargs="+", choices=[*STORIES], default=here)
     parser.add_argument("--kills", type=int, default=25, help="of each story")
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no more is killed")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--cost", type=int, metavar="STEPS", help="measure the default grid instead")
+    parser.add_argument("--cost", type=int, metavar="STEPS", help="measure checkpoints instead")
     parser.add_argument("--out", type=Path, help="JSON to write, or to add to")
     given = parser.parse_args(words)
     import torch

@@ -68,8 +68,9 @@ def advantages_by_step(make, settings, *, rollouts=2):
     """
     env = make()
     agent = tightrope.PPO(
-        env, policy=Scripted(), seed=BASE_SEED, gamma=GAMMA, gae_lambda=LAMBDA, num_steps=COLUMNS,
-        normalise_observations=False, normalise_values=False, **{"num_envs": 2, **settings},
+        env, policy=Scripted(), seed=BASE_SEED, reseed_after=None, gamma=GAMMA, gae_lambda=LAMBDA,
+        num_steps=COLUMNS, normalise_observations=False, normalise_values=False,
+        **{"num_envs": 2, **settings},
     )  # fmt: skip
     agent.collector.reset(BASE_SEED)
     found = {}

@@ -163,7 +163,7 @@ class Sum(nn.Module):
 
 
 def agent_on(env, **values):
-    both = dict(normalise_observations=True, normalise_rewards=True)
+    both = dict(normalise_observations=True, normalise_rewards=True, reseed_after=None)
     return tightrope.PPO(env, policy=Sum(), seed=BASE_SEED, num_envs=2, num_steps=30, **{**both, **values})
 
 

@@ -19,6 +19,8 @@ from tightrope.control.agent import Agent
 from tightrope.control.environments import state as states
 from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.seeds import EVALUATION, TRAINING, episode_seed
+from tightrope.control.environments.tasks import make_vector_by_id, resets_rows_with_seeds
 from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve
 from tightrope.runs import checkpoint
@@ -197,45 +199,210 @@ def test_points_of_a_grid():
     assert all(crosses(step - 1, step, 3, 1 / 3) for step in (1, 2, 3)), "a rounding error loses no point"
 
 
-@pytest.mark.parametrize("source", ["CartPole-v1", walk])
-def test_environments_are_reset_only_on_the_grid_unless_they_save_their_state(tmp_path, source):
-    """Without files, signals or clocks: learn in Python resets at the same steps as a run."""
-    seen: list[int] = []
-    agent = tightrope.PPO(source, notify=lambda text: None, **{**SMALL, "engine": "torch"})
-    real = agent.environments.reset
-    agent.environments.reset = lambda seed: seen.append(seed) or real(seed)  # type: ignore[method-assign]
-    points = [report.step for report in agent.iterate() if report.on_grid]
+class Clock(gym.Env):
+    """Ends after its own 150 steps, with the reward at the end."""
+
+    observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.time = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.time += 1
+        over = self.time == 150
+        return np.array([self.time / 150], np.float32), float(over), over, False, {}
+
+
+def make(env: Any, **values: Any) -> Agent:
+    values = {**SMALL, "engine": "torch", "notify": lambda text: None, **values}
+    return tightrope.PPO(env, **values)
+
+
+def same_weights(a: Agent, b: Agent) -> bool:
+    weights = b.policy.state_dict()
+    return all(torch.equal(x, weights[name]) for name, x in a.policy.state_dict().items())
+
+
+def test_nothing_is_reset_for_a_checkpoint_or_between_two_calls_of_learn():
+    """600 steps are one episode of 150 in each copy, over four points of the grid and six calls."""
+    a, b = make(Clock, checkpoint_every=0.2), make(Clock, checkpoint_every=0.2)
+    reports = list(a.iterate(600))
+    assert sum(report.on_grid for report in reports) == 5
+    found = [list(report.episodes) for report in reports]
+    for _ in range(6):
+        b.learn(100)
+    a.close()
+    b.close()
+    assert [episode[:3] for episode in found[-1]] == [(1.0, 150, True)] * 4 and not any(found[:-1])
+    assert b.collector.boundary().running.origins.tolist() == [[1, 0, 0]] * 4
+
+
+@pytest.mark.parametrize(
+    ("env", "values"),
+    [("CartPole-v1", {"vector_backend": "serial"}), ("CartPole-v1", {"vector_backend": "vector"}), (walk, {}),
+     ("Pendulum-v1", {"vector_backend": "workers", "num_workers": 2, "std": "gsde"})],
+    ids=["serial", "vector", "own state", "workers"],
+)  # fmt: skip
+def test_saving_changes_nothing_and_loading_goes_on(tmp_path, env, values):
+    a, b = make(env, **values).learn(500), make(env, **values).learn(500)
+    a.save(tmp_path / "a")
+    c = tightrope.load(tmp_path / "a", env=env if env is walk else None)
+    c.save(tmp_path / "again")  # before anything was learned
+    d = tightrope.load(tmp_path / "again", env=env if env is walk else None)
+    for agent in (a, b, c, d):
+        agent.learn(500)
+        assert same_weights(a, agent)
+    for agent in (a, b, c, d):
+        agent.close()
+
+
+def test_ataris_vector_version_goes_on_where_it_was_saved(tmp_path):
+    """Its episodes get seeds by masked resets, every 100 steps here, and a replay begins with them."""
+    pytest.importorskip("ale_py")
+    if not resets_rows_with_seeds(make_vector_by_id("ALE/Breakout-v5", 1)):
+        return  # an older ale-py: told, not exact
+    values = {"num_envs": 2, "num_steps": 64, "minibatch_size": 64, "num_epochs": 1, "reseed_after": 100}
+    a = make("ALE/Breakout-v5", **values).learn(640)
+    a.save(tmp_path / "a")
+    lengths = a.collector.boundary().running.origins[:, 2]
+    b = tightrope.load(tmp_path / "a")
+    for agent in (a, b):
+        agent.learn(256)
+    assert same_weights(a, b) and len(set(lengths)) == 2
+    a.close()
+    b.close()
+
+
+def test_a_snapshot_while_a_rollout_is_collected_is_the_last_boundary(tmp_path):
+    """Ctrl-C saves it."""
+    for env, backend in (("CartPole-v1", "serial"), ("CartPole-v1", "vector")):
+        a = make(env, vector_backend=backend).learn(300)
+        inside = make(env, vector_backend=backend).learn(300)
+        found: list[Any] = []
+        real, count = inside.environments.receive, 0
+
+        def receive() -> Any:
+            nonlocal count
+            count += 1
+            if count == 20:
+                found.append(inside.save(tmp_path / backend))  # noqa: B023
+            return real()  # noqa: B023
+
+        inside.environments.receive = receive  # type: ignore[method-assign]
+        inside.learn(100)
+        b = tightrope.load(tmp_path / backend)
+        assert b.steps == a.steps
+        assert same_weights(a.learn(300), b.learn(300))
+        for agent in (a, inside, b):
+            agent.close()
+
+
+def test_each_episode_has_a_seed_of_its_own_and_it_is_recorded():
+    agent = make("CartPole-v1", vector_backend="serial")
+    seeds = [seed for report in agent.iterate(600) for seed, after in report.seeds if not after]
     agent.close()
-    assert points == [200, 400, 600]  # 180, 360 and 540, at the end of the current update
-    assert seen[0] == SMALL["seed"]
-    assert len(seen) == len(set(seen)) == (1 if source is walk else 3)  # nothing begins after the end
+    assert len(set(seeds)) == len(seeds) > 10
+    wanted = {episode_seed(SMALL["seed"], TRAINING, copy, k) for copy in range(4) for k in range(30)}
+    assert set(seeds) <= wanted
 
 
-def test_cut_episodes_are_not_counted_and_their_rewards_are_forgotten():
-    """Pendulum's episodes have 200 steps; these are cut after 150, 100 and 150."""
-    agent = tightrope.PPO("Pendulum-v1", notify=lambda text: None, **{**SMALL, "total_steps": 1600,
-                          "num_steps": 50, "engine": "torch"})  # fmt: skip
-    at_start, real = [], agent.collector.collect
+def test_no_two_run_seeds_share_seeds():
+    streams = {(run, stream): {episode_seed(run, stream, copy, k) for copy in range(8) for k in range(100)}
+               for run in range(4) for stream in (TRAINING, EVALUATION)}  # fmt: skip
+    assert all(len(found) == 800 for found in streams.values())
+    assert len(set().union(*streams.values())) == 800 * len(streams)
+    assert all(0 <= seed < 2**31 for found in streams.values() for seed in found)
 
-    def collect(engine: Any, columns: int, warm_up: int) -> Any:
-        at_start.append(bool(agent.normalisers.rewards.running.any()))
-        return real(engine, columns, warm_up)
 
-    agent.collector.collect = collect  # type: ignore[method-assign]
-    reports = list(agent.iterate())
+def test_seeds_may_be_further_apart_and_nothing_else_changes_then(tmp_path, monkeypatch):
+    agent = make("CartPole-v1", vector_backend="serial", reseed_after=100)
+    seeds = [seed for report in agent.iterate(600) for seed in report.seeds]
     agent.close()
-    assert not any(report.episodes for report in reports)
-    anew = [True, *(report.on_grid for report in reports[:-1])]
-    assert at_start == [not begins for begins in anew] and anew.count(True) == 3
+    assert {after for _, after in seeds} > {0, 1, 2} and len(set(seeds)) == len(seeds)
+    settings = settings_for("CartPole-v1", engine="torch", vector_backend="serial", reseed_after=100)
+    train.train(settings, run_dir=tmp_path / "whole")
+    killed(settings, tmp_path / "hops", monkeypatch, Agent, "_one_update", 4)
+    train.resume(tmp_path / "hops")
+    assert_same_end(tmp_path / "whole", tmp_path / "hops")
 
 
-def test_the_default_grid_leaves_room_for_an_episode():
-    assert resolve("CartPole-v1").checkpoint_every == 0.05
-    coarse = resolve("CartPole-v1", overrides={"total_steps": 20_000, "num_envs": 8})
-    assert coarse.checkpoint_every == pytest.approx(0.2)
-    assert resolve("CartPole-v1", overrides={"total_steps": 1000}).checkpoint_every == 1.0
-    given = resolve("CartPole-v1", overrides={"total_steps": 1000, "checkpoint_every": 0.1})
-    assert given.checkpoint_every == 0.1
+class Forgetful(gym.Env):
+    """Its episodes do not repeat: the ``what`` of step 5 comes from a counter that no reset knows."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    count = 0
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.time = 0
+        Forgetful.count += 1
+        return self._seen(float(Forgetful.count) if self.what == "reset" else 0.0)
+
+    def _seen(self, value: float) -> tuple[np.ndarray, dict]:
+        mask = np.array([1, self.what != "mask" or self.time != 5 or Forgetful.count < 500])
+        return np.array([value], np.float32), {"action_mask": mask}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.time += 1
+        Forgetful.count += 1
+        odd = float(Forgetful.count) if self.time == 5 else 0.0
+        observation, info = self._seen(odd if self.what == "observation" else 0.0)
+        over = self.time == 500 or (self.what == "end" and odd > 500)
+        return observation, odd if self.what == "reward" else 0.0, over, False, info
+
+
+@pytest.mark.parametrize(
+    ("what", "place"),
+    [("observation", "step 5 of 75: another observation"), ("reward", "step 5 of 75: another reward"),
+     ("mask", "step 5 of 75: another action mask"), ("end", "another end of the episode"),
+     ("reset", "its reset: another observation")],
+)  # fmt: skip
+def test_a_replay_names_the_first_step_that_differs(tmp_path, monkeypatch, what, place):
+    Forgetful.count = 0
+    env = lambda: Forgetful(what)  # noqa: E731
+    settings = settings_for(env, engine="torch", evaluate_every=None, num_envs=1, minibatch_size=25,
+                            total_steps=150, checkpoint_every=0.5)  # fmt: skip
+    killed(settings, tmp_path / "run", monkeypatch, Agent, "_one_update", 5, env=env)
+    Forgetful.count = 1000
+    said: list[str] = []
+    train.resume(tmp_path / "run", env=env, listeners=[lambda event: said.append(str(event))])
+    told = [line for line in said if line.startswith("warning: 1 of 1 copies did not repeat")]
+    assert len(told) == 1 and place in told[0] and "copy 0, episode 0" in told[0]
+    assert Run.open(tmp_path / "run").newest().state["steps"] == 150
+
+
+@pytest.mark.parametrize(("columns", "replayed"), [(5, 0), (6, 1), (4, 4)])
+def test_a_replay_of_no_step_of_one_and_of_all_but_one(tmp_path, columns, replayed):
+    env = lambda: gym.wrappers.TimeLimit(gym.make("Pendulum-v1").unwrapped, 5)  # noqa: E731
+    values = {"num_steps": columns, "num_envs": 2, "minibatch_size": 2 * columns}
+    a = make(env, **values).learn(2 * columns)
+    a.save(tmp_path / "a")
+    assert a.collector.boundary().running.origins[:, 2].tolist() == [replayed] * 2
+    b = tightrope.load(tmp_path / "a", env=env)
+    for agent in (a, b):
+        agent.learn(8 * columns)
+    assert same_weights(a, b)
+    a.close()
+    b.close()
+
+
+def test_an_episode_beyond_the_limit_goes_on_and_begins_again_at_a_resume(tmp_path, monkeypatch):
+    settings = settings_for(Clock, engine="torch", replay_limit=40, evaluate_every=None, total_steps=800)
+    said: list[str] = []
+    listen = [lambda event: said.append(str(event))]
+    train.train(settings, run_dir=tmp_path / "whole", env=Clock, listeners=listen)
+    assert len([line for line in said if "longer than replay_limit 40" in line]) == 1
+    assert [row["length"] for row in rows_of(tmp_path / "whole", "episodes.jsonl")] == [150] * 4
+    killed(settings, tmp_path / "hops", monkeypatch, Agent, "_one_update", 5, env=Clock)
+    train.resume(tmp_path / "hops", env=Clock)
+    assert not rows_of(tmp_path / "hops", "episodes.jsonl"), "new ones began at step 300"
 
 
 def test_evaluation_disturbs_nothing(tmp_path, whole):
@@ -297,32 +464,33 @@ def test_a_state_that_cannot_be_kept_names_the_environment():
         def get_state(self) -> dict:
             return {"inner": [object()]}
 
-    with make_environments(Odd, 2, backend="serial") as environments:
+    with (
+        make_environments(Odd, 2, backend="serial", reseed_after=0) as environments,
+        pytest.raises(EnvironmentFault, match=r"environment 0 \(Odd\) .*'inner'\]\[0\] is a obj"),
+    ):
         environments.reset(0)
-        with pytest.raises(
-            EnvironmentFault, match=r"state of environment 0 \(Odd\) .*'inner'\]\[0\] is a obj"
-        ):
-            environments.get_state()
 
 
 def test_a_state_of_other_shapes_is_refused(tmp_path):
     """The compiled engine would read beyond it."""
     run = tmp_path / "run"
     train.train(settings_for(walk, engine="torch", total_steps=200), run_dir=run, env=walk)
-    folder, tensors, state = Run.open(run).newest()
-    short, ints = np.zeros(1), np.zeros(4, np.float32)
-    for name, wrong in {"_returns": short, "_lengths": ints, "_inputs": {"flat": ints[:, None]}}.items():
-        episodes = {**state["episodes"], name: states.encode(wrong)}
-        checkpoint.save(folder, tensors, {**state, "episodes": episodes})
-        with pytest.raises(
-            checkpoint.CheckpointError, match=f"{name[1:]} of the episodes have another shape"
-        ):
+    folder, _, state = Run.open(run).newest()
+    tensors = checkpoint.load(folder)[0]
+    episodes = state["episodes"]
+    for name, wrong, why in (
+        ("returns", states.encode(np.zeros(1)), "returns of the episodes have another shape"),
+        ("lengths", states.encode(np.zeros(4, np.float32)), "lengths of the episodes have another shape"),
+        ("origins", [[0, 0, 3]], "cannot reshape"),
+        ("origins", [[0, 0, 3]] * 4, "the log of copy 0 does not fit"),
+        ("first", [1], "first of the episodes have another shape"),
+    ):
+        checkpoint.save(folder, tensors, {**state, "episodes": {**episodes, name: wrong}})
+        with pytest.raises(checkpoint.CheckpointError, match=why):
             train.resume(run, env=walk)
-    for seed in ("1", 2**70, -1):
-        environments = {**state["episodes"]["environments"], "seed": seed}
-        episodes = {**state["episodes"], "environments": environments}
-        checkpoint.save(folder, tensors, {**state, "episodes": episodes})
-        with pytest.raises(checkpoint.CheckpointError, match=f"the seed of the episodes is {seed}"):
+    for wrong in ({"0.0": 10**6}, {"0.0": "x"}):
+        checkpoint.save(folder, tensors, {**state, "growing": wrong})
+        with pytest.raises(checkpoint.CheckpointError, match=r"does not hold what belongs there"):
             train.resume(run, env=walk)
     checkpoint.save(folder, tensors, state)
     Run.open(run).update_settings({**Run.open(run).settings, "total_steps": "many"})
@@ -336,10 +504,19 @@ def test_resume_prints_what_it_cannot_promise(tmp_path, monkeypatch):
     said: list[str] = []
     monkeypatch.setattr(np, "__version__", "0.1")
     train.resume(tmp_path / "run", listeners=[lambda event: said.append(str(event))])
-    told = [line for line in said if "begin new episodes" in line or "-> 0.1" in line]
-    assert len(told) == 2, said
-    assert "numpy" in told[0] and "-> 0.1 since the checkpoint" in told[0]
-    assert "4 environments begin new episodes at step 200" in told[1]
+    told = [line for line in said if "-> 0.1" in line]
+    assert len(told) == 1 and "numpy" in told[0] and "-> 0.1 since the checkpoint" in told[0]
+
+
+def test_environments_that_cannot_be_continued_are_told_once(tmp_path):
+    vector = gym.vector.SyncVectorEnv([walk] * 4)
+    said: list[str] = []
+    settings = settings_for(vector, engine="torch")
+    listen = [lambda event: said.append(str(event))]
+    train.train(settings, run_dir=tmp_path / "run", env=vector, listeners=listen)
+    assert len([line for line in said if "they begin new episodes" in line]) == 1
+    train.resume(tmp_path / "run", env=vector, total_steps=700)
+    vector.close()
 
 
 def test_evaluating_twice_gives_the_same(whole):

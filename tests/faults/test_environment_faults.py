@@ -21,9 +21,10 @@ from gymnasium import spaces
 
 import tightrope
 from tightrope.cli.main import main
-from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy, pause, restart_seed
+from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy, pause
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.processes import STEP
+from tightrope.control.environments.seeds import TRAINING, episode_seed
 from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import BadNumbers
 from tightrope.control.train import resume, train
@@ -33,8 +34,12 @@ SMALL = {"num_envs": 4, "num_steps": 16, "minibatch_size": 32, "num_epochs": 1, 
 AT = 5
 
 
+def seed_of(row, episode=0):
+    return episode_seed(SMALL["seed"], TRAINING, row, episode)
+
+
 class Frail(gym.Env):
-    """The observation is the seed and the step; copy ``row`` (seeded with 5 + row) fails at step AT."""
+    """The observation is the seed and the step; the first episode of copy ``row`` fails at step AT."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = spaces.Discrete(2)
@@ -45,7 +50,7 @@ class Frail(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         if seed is not None:
-            self.seed, self.mine = seed, self.always or seed == SMALL["seed"] + self.row
+            self.seed, self.mine = seed, self.always or seed in (SMALL["seed"] + self.row, seed_of(self.row))
             if self.how == "reset" and self.mine:
                 raise OSError("no display")
         self.t = 0
@@ -150,9 +155,10 @@ def test_every_fault_names_environment_worker_step_seed_and_action(how, backend,
     assert time.monotonic() - begin < 10
     fault, text = caught.value, str(caught.value)
     worker = 2 if backend == "workers" else 0
-    assert (fault.index, fault.step, fault.env_id, fault.worker, fault.seed) == (3, AT, "frail", worker, 8)
+    assert (fault.index, fault.step, fault.env_id, fault.worker) == (3, AT, "frail", worker)
+    assert fault.seed == seed_of(3)
     assert fault.action in ("0", "1") and f"last action {fault.action}" in text
-    assert "environment 3" in text and "step 5" in text and "seed 8" in text and "frail" in text
+    assert "environment 3" in text and "step 5" in text and f"seed {seed_of(3)}" in text and "frail" in text
     assert f"worker {worker}" in text if worker else "in this process" in text
     if how == "raise":
         assert "Traceback" in text and 'RuntimeError("the simulator broke")' in text
@@ -165,7 +171,8 @@ def test_numbers_that_are_not_finite_are_named_likewise(how, what, backend, agen
     agent = agent_on(how, backend)
     worker = "worker 2" if backend == "workers" else "in this process"
     step = AT if how == "nan" else AT - 1
-    with pytest.raises(BadNumbers, match=rf"Environment 3 of .*{what} at step {step}.*\({worker}, seed 8, "):
+    where = rf"at step {step}.*\({worker}, seed {seed_of(3)}, "
+    with pytest.raises(BadNumbers, match=rf"Environment 3 of .*{what} {where}"):
         agent.learn(1000)
 
 
@@ -219,7 +226,7 @@ def test_the_failed_step_does_not_count_and_the_one_before_is_bootstrapped(how, 
 
     plain = {"normalise_observations": False, "normalise_rewards": False}
     agent = agent_on(how, on_env_fault="restart", length=12, **plain)
-    agent.collector.reset(SMALL["seed"], 0)
+    agent.collector.reset(SMALL["seed"])
     rollout = agent.collector.collect(agent.engine, 16)
     others = [row for row in range(4) if row not in rows]
     column = AT - 1  # the fifth step
@@ -228,7 +235,7 @@ def test_the_failed_step_does_not_count_and_the_one_before_is_bootstrapped(how, 
     assert rollout.mask[others].all() and not rollout.terminated.any()
     # the cut episode does not count; the next ones start after it, with their own seed
     assert rollout.episodes == [(12.0, 12, False)] * len(others)
-    seeds = [restart_seed(SMALL["seed"], 1, row) for row in rows]
+    seeds = [seed_of(row, 1) for row in rows]
     np.testing.assert_array_equal(rollout.inputs["flat"][rows, column + 1, 0], np.float32(seeds))
     assert (agent.collector._lengths[rows] == 16 - AT).all()
     batch = to_batch(rollout, agent.engine, agent.normalisers, agent.settings.update)
@@ -252,7 +259,7 @@ def test_an_environment_that_fails_only_in_the_reset_after_an_episode_loses_no_s
         assert first.cut is None and second.cut is None and third.cut is None
         assert second.truncated.all() and second.rewards.tolist() == [1.0, 1.0]
         assert second.final_inputs["flat"][:, 1].tolist() == [2.0, 2.0]
-        assert second.inputs["flat"][:, 0].tolist() == [np.float32(restart_seed(5, 1, 0)), 0.0]
+        assert second.inputs["flat"][:, 0].tolist() == [np.float32(seed_of(0, 2)), 0.0]
         assert environments.restarts == 1
 
 
@@ -307,7 +314,7 @@ def test_restarts_are_in_the_metrics_of_a_run_and_episodes_are_none_of_them(tmp_
 
 
 class Keeper(Frail):
-    """Copy 3 fails when its state is saved (``how`` "kill get") or restored."""
+    """The first episode of copy 3 fails when its state is saved (``how`` "kill get") or put back."""
 
     def _keep(self, when):
         how, _, at = self.how.partition(" ")
@@ -326,40 +333,32 @@ class Keeper(Frail):
 @pytest.mark.parametrize(
     ("how", "backend", "words"),
     [
-        (
-            "kill get",
-            "workers",
-            r"worker 2 .* died \(exit code -9\).* state of environment 3: step 1, .*seed 8",
-        ),
-        (
-            "kill set",
-            "workers",
-            r"worker 2 .* died \(exit code -9\).* state of environment 3: the reset, seed 8",
-        ),
-        ("hang get", "workers", r"worker 2 .* not answered for 0.5 s .* state of environment 3: step 1, "),
-        (
-            "hang get",
-            "serial",
-            r"the state of environment 3 .* cannot be kept: EnvironmentTimeout: not back after 0.5 s",
-        ),
+        ("kill get", "workers", r"worker 2 .* died \(exit code -9\).* environment 3: the reset, seed"),
+        ("kill set", "workers", r"worker 2 .* died \(exit code -9\).* environment 3: the reset, seed"),
+        ("hang get", "workers", r"worker 2 .* not answered for 0.5 s .* environment 3: the reset, seed"),
+        ("hang get", "serial", r"environment 3 .*not back after 0.5 s"),
     ],
 )
 @pytest.mark.parametrize("restart", [False, True])
-def test_a_fault_while_a_state_is_kept_is_named_and_ends_the_run(how, backend, words, restart):
+def test_a_fault_while_a_state_is_kept_is_one_of_the_environment(how, backend, words, restart):
     policy = FaultPolicy(restart, 3, 0.5)
     number = {"num_workers": 2} if backend == "workers" else {}
-    with make_environments(lambda: Keeper(how), 4, backend=backend, policy=policy, **number) as environments:
-        environments.reset(SMALL["seed"])
-        environments.step(np.zeros((4, 1), np.float32))
+    with make_environments(
+        lambda: Keeper(how), 4, backend=backend, policy=policy, reseed_after=0, **number
+    ) as environments:
+        if restart:
+            environments.reset(SMALL["seed"])
+            assert environments.restarts == 1 and len(environments.carried()) == 4
+            return
         with pytest.raises(EnvironmentFault, match=words):
-            environments.set_state(environments.get_state())
+            environments.reset(SMALL["seed"])
 
 
 class Choosy(Keeper):
     """Cannot be reset with the first seed of copy 3."""
 
     def reset(self, *, seed=None, options=None):
-        if seed == SMALL["seed"] + 3:
+        if seed == seed_of(3):
             raise OSError("no display")
         return super().reset(seed=seed)
 
@@ -446,7 +445,8 @@ class FrailVector(gym.vector.SyncVectorEnv):
     def __init__(self, num_envs=2, how="raise", **_):
         type(self).made += 1
         how = how if type(self).made == 1 else "no"
-        super().__init__([lambda: Frail(how, row=1)] * num_envs, autoreset_mode="SameStep")
+        second = [lambda i=i: Frail(how, always=i == 1) for i in range(num_envs)]
+        super().__init__(second, autoreset_mode="SameStep")
 
 
 @pytest.mark.parametrize(
@@ -460,7 +460,7 @@ def test_a_users_vector_environment_is_named_and_cannot_be_restarted(how, words)
     with pytest.raises(EnvironmentFault, match=words) as caught:
         agent.learn(1000)
     text = str(caught.value)
-    assert "at step 5" in text and "seed 5" in text and "last action [" in text
+    assert "at step 5" in text and f"seed {seed_of(0)}" in text and "last action [" in text
     assert "cannot be restarted" in text and "Traceback" in text
     agent.close()
     vector.close()
@@ -494,3 +494,82 @@ def test_evaluation_leaves_out_what_a_fault_cut(agent_on):
         assert environments.restarts == 1
     assert found["returns"] == [7.0] * 6
     agent.close()
+
+
+# ------------------------------------------------------------------------------- the episode that failed
+
+
+class Loose(gym.Wrapper):
+    """Fails in a state that depends on the seed and the actions."""
+
+    def __init__(self, env, how):
+        super().__init__(env)
+        self.how = how
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        if abs(observation[2]) > 0.15:
+            if self.how == "nan":
+                return observation * np.nan, *rest
+            raise RuntimeError("the pole is loose")
+        return observation, *rest
+
+
+@pytest.mark.parametrize(("how", "policy"), [("raise", "raise"), ("nan", "raise"), ("raise", "restart")])
+@pytest.mark.parametrize("backend", ["serial", "workers"])
+@pytest.mark.parametrize("reseed_after", [0, 60])
+def test_a_fault_leaves_the_episode_that_failed_and_three_lines_repeat_it(
+    tmp_path, how, policy, backend, reseed_after
+):
+    gym.register(
+        "tightrope_tests/Loose-v0", lambda length: Loose(gym.make("CartPole-v1"), how), kwargs={"length": 3}
+    )
+    values = {**SMALL, "vector_backend": backend, "total_steps": 192, "evaluate_every": None}
+    values |= {
+        "on_env_fault": policy,
+        "reseed_after": reseed_after,
+        "max_env_restarts": 1000,
+        "engine": "torch",
+    }
+    said = []
+    try:
+        settings = resolve("tightrope_tests/Loose-v0", "ppo", values)
+        try:
+            train(settings, run_dir=tmp_path / "r", listeners=[lambda event: said.append(str(event))])
+        except (EnvironmentFault, BadNumbers) as error:
+            said.append(str(error))
+        files = sorted((tmp_path / "r").glob("fault-*.json"))
+        assert len(files) == 1 if policy == "raise" else len(files) > 1
+        for file in files:
+            assert any(str(file) in line for line in said)
+            fault = json.loads(file.read_text())
+            env = gym.make(fault["id"], **fault["kwargs"])
+            env.reset(seed=fault["seed"])
+            for action in fault["actions"][:-1]:
+                observation, _, terminated, truncated, _ = env.step(
+                    np.asarray(action, env.action_space.dtype)
+                )
+                if terminated or truncated:
+                    assert fault["after"]
+                    env.reset()
+            assert fault["kwargs"] == {"length": 3} and np.isfinite(observation).all()
+            if how == "nan":
+                assert np.isnan(env.step(fault["actions"][-1])[0]).all()
+                continue
+            with pytest.raises(RuntimeError, match="the pole is loose"):
+                env.step(fault["actions"][-1])
+    finally:
+        del gym.registry["tightrope_tests/Loose-v0"]
+
+
+def test_a_run_tells_once_that_no_episode_finishes(tmp_path):
+    said = []
+    for length, total in ((4000, 16_000), (1200, 24_000)):
+        env = lambda length=length: Frail("no", length=length)  # noqa: E731
+        values = {**SMALL, "vector_backend": "serial", "evaluate_every": None, "num_steps": 256}
+        values |= {"engine": "torch", "total_steps": total, "minibatch_size": 1024}
+        settings = resolve(env, "ppo", values)
+        listen = [lambda event: said.append(str(event))]
+        train(settings, run_dir=tmp_path / str(length), env=env, listeners=listen)
+    told = [line for line in said if line.startswith("No episode has finished")]
+    assert len(told) == 1 and "the longest has run for 1,024 steps" in told[0]

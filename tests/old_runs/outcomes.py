@@ -194,9 +194,12 @@ def end_of(name: str) -> Outcome:
 
 
 def resumed(name: str) -> Outcome:
-    """The killed run, resumed to its end as a user would."""
-    if ENVIRONMENTS.get(name) is not None:
-        train.resume(name, env=ENVIRONMENTS[name])
+    """The killed run, resumed to its end as a user would, or why it cannot be."""
+    if name in ENVIRONMENTS:
+        try:
+            train.resume(name, env=ENVIRONMENTS[name])
+        except ValueError as refusal:
+            return outcome({"refused": str(refusal)})
     elif code := main(["resume", name, "--quiet"]):
         raise AssertionError(f"tightrope resume {name} ends with {code}")
     return end_of(name)

@@ -113,9 +113,21 @@ def test_the_first_day_is_whole():
         checkpoint.load(folder)
 
 
+def test_control_runs_of_the_first_day_are_refused_with_the_version(stand_in):
+    stand_in(FIRST)
+    for name in ENVIRONMENTS:
+        files = {path: path.read_bytes() for path in sorted(Path(name).rglob("*")) if path.is_file()}
+        assert main(["resume", name, "--quiet"]) == 2
+        left = {path: path.read_bytes() for path in sorted(Path(name).rglob("*")) if path.is_file()}
+        assert {k: v for k, v in left.items() if k.name != "writer.lock"} == {
+            k: v for k, v in files.items() if k.name != "writer.lock"
+        }
+        assert "(0.1.0)" in recorded(FIRST, f"{name}-resumed")["numbers"]["refused"]
+
+
 def test_a_resume_has_work_to_do():
     """A killed run has rows after its newest checkpoint, which a resume must cut off and repeat."""
-    for name in (*ENVIRONMENTS, "sft-killed", "reward-killed", "align-killed"):
+    for name in ("sft-killed", "reward-killed", "align-killed"):
         run = FIRST / name
         rows = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
         newest = max(int(path.name[5:]) for path in (run / "checkpoints").iterdir())
@@ -179,7 +191,9 @@ LAST_BITS = {
 
 @pytest.fixture(scope="module")
 def end() -> dict[str, Any]:
-    return recorded(FIRST, "cartpole-resumed")
+    """The end of a run of that day, which has everything that a record may have."""
+    example = HERE / "example.json"
+    return {"numbers": read(example), "tensors": load_file(example.with_suffix(".safetensors"))}
 
 
 @pytest.mark.parametrize("bits", [True, False], ids=["to the bit", "within"])

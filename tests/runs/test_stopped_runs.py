@@ -58,7 +58,6 @@ def steps_of(run: Path) -> list[int]:
 POOL = "tightrope.control.environments.pool.EnvironmentPool"
 # where the signal comes, in which call, and the step that is saved; an update is 100 steps
 PHASES = {
-    "resetting": (f"{POOL}.reset", 3, 200),
     "collecting": (f"{POOL}.receive", 60, 200),
     "advantages": ("tightrope.control.agent.to_batch", 3, 300),
     "updating": ("tightrope.algorithms.descent.check_first_ratios", 3, 300),
@@ -225,7 +224,6 @@ def test_ctrl_c_in_learn_leaves_the_agent_at_its_last_update(monkeypatch, backen
     other.learn(100)
     assert_same_agents(agent, other)
     assert agent.predict(np.zeros(4, np.float32))[0] in (0, 1)
-    other.fresh = True  # the rollout was dropped: new episodes begin
     for one in (agent, other):
         one.learn(200)
         one.close()

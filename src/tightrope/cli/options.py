@@ -48,6 +48,7 @@ GROUPS = {
         "keep_checkpoints",
         "tensorboard",
     ),
+    "episodes": ("reseed_after", "replay_limit", "carried", "repeats"),
     "faults": ("on_env_fault", "max_env_restarts", "env_timeout", "max_rollbacks"),
     "machine": ("vector_backend", "num_workers", "engine", "device", "threads", "compile"),
 }

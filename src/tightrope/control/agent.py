@@ -27,22 +27,23 @@ from tightrope.algorithms.settings import PPOSettings, UpdateSettings
 from tightrope.control.engine.base import limited_threads
 from tightrope.control.engine.choose import choose_engine, usable_device
 from tightrope.control.environments.base import Environments
-from tightrope.control.environments.faults import policy_of, require_finite
+from tightrope.control.environments.faults import FailedEpisode, policy_of, require_finite
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
 from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.policy.policy import Policy
-from tightrope.control.resolve import anywhere, require_room, resolve
+from tightrope.control.resolve import anywhere, require_room, resolve, resolved
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.episodes import FinishedEpisodes
-from tightrope.control.rollout.rollout import cut_shares, to_batch
+from tightrope.control.rollout.rollout import Rollout, cut_shares, to_batch
+from tightrope.control.rollout.running import Before, begin
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces.structure import Array, Inputs, Reading, structure
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint, generators, signals
-from tightrope.training.events import Message
+from tightrope.runs.growing import GROUP as ACTIONS
 from tightrope.training.learner import Update, crosses
 from tightrope.training.memory import DoesNotFit
 from tightrope.training.parameters import Tensors, whole_update
@@ -93,13 +94,17 @@ class Agent:
         # three streams: what predict draws must not change what training draws
         seeds = ([present.seed, k] for k in (1, 2, 4))
         self.sampling_rng, self.update_rng, self.predict_rng = (np.random.default_rng(x) for x in seeds)
-        self.collector = Collector(self.environments, self.normalisers, self.sampling_rng)
+        self.collector = self._collector()
         self.steps, self.rollbacks, self.kl_beta = 0, 0, getattr(present.update, "kl_beta", None)
         self.changes: dict[str, Any] = {}  # of the update rule's settings, made by a listener
         self.episodes = FinishedEpisodes()
-        self.fresh, self.begun, self.notify = True, False, notify  # fresh: new episodes with the next rollout
+        self.begun, self.notify = False, notify
+        self._fresh = True  # before the next rollout episodes begin: those of a checkpoint, or new ones
+        self._saved: tuple[Any, Tensors] = (None, {})  # of a checkpoint: the running episodes and their logs
+        self._before: Before | None = None  # the update that is under way
+        self.failed: list[FailedEpisode] = []  # of environments that were restarted in the last update
         self._update_seconds: float | None = None  # of the newest update
-        self.settings = _resolved(present, self.environments, self.engine.name, threads)
+        self.settings = resolved(present, self.environments, self.engine.name, threads)
         if settings is None:
             for text in self.without_effect(present):
                 notify(text)
@@ -158,16 +163,17 @@ class Agent:
             # BLAS threads beside the engine's two only spin: its products are too small to share
             threads = 1 if self.engine.name == "fused" else self.settings.threads or 1
             with limited_threads(threads), self._whole_updates():
-                metrics, episodes = self._one_update(*sizes, before / budget)
+                metrics, rollout = self._one_update(*sizes, before / budget)
                 after = self.steps - start
                 on_grid = crosses(before, after, budget, self.settings.checkpoint_every)
-                self.fresh = on_grid and not self.environments.gives_state
-            yield Update(after, budget, metrics, before, on_grid, episodes)
+                self.failed = rollout.failed
+            yield Update(after, budget, metrics, before, on_grid, rollout.episodes, seeds=rollout.seeds)
 
     @contextlib.contextmanager
     def _whole_updates(self) -> Iterator[None]:
         """Around an update. What ends it before it is complete (a signal, a fault) drops its rollout: random
-        generators and statistics go back to where they were, and new episodes begin with the next one.
+        generators and statistics go back to where they were, and the running episodes are repeated before the
+        next one.
         """
         generators = (self.sampling_rng, self.update_rng)
         with signals.stoppable(only_ctrl_c=True), signals.uninterrupted():
@@ -180,7 +186,8 @@ class Agent:
                     rng.bit_generator.state = state
                 self.normalisers.load(statistics)
                 self.collector.drop()
-                self.fresh = True
+                if self._before is not None:
+                    self._fresh, self._saved, self._before = True, self._before.episodes(), None
                 raise
 
     def _learned(self) -> Tensors:
@@ -212,18 +219,17 @@ class Agent:
         enough = self.steps == start or columns >= min(MIN_COLUMNS, most)
         return warm_up, columns if enough else 0
 
-    def _one_update(
-        self, warm_up: int, columns: int, progress: float
-    ) -> tuple[dict[str, float], list[tuple[float, int, bool]]]:
+    def _one_update(self, warm_up: int, columns: int, progress: float) -> tuple[dict[str, float], Rollout]:
         """collect -> advantages -> update -> statistics."""
+        self._before = self._present()
         present = self.settings.update.unchecked(**self.changes).at(progress)
         if isinstance(present, PPOSettings) and self.kl_beta is not None:
             present = present.unchecked(kl_beta=self.kl_beta)
         set_learning_rates(self.optimiser, present)
         begin = time.perf_counter()
         with signals.interruptible():
-            if self.fresh:
-                self.collector.reset(self.settings.seed, self.steps)
+            for line in self.begin_episodes():
+                self.notify(line)
             rollout = self.collector.collect(self.engine, columns, warm_up)
         collected = time.perf_counter()
         with whole_update(self._update_seconds, self._learned, self._unlearn):
@@ -245,6 +251,7 @@ class Agent:
             self.kl_beta = ppo.next_kl_beta(present.kl_beta, kl, present.kl_adapt)
         self.normalisers.update(rollout)
         self.steps += rollout.steps
+        self._before = None
         finish = time.perf_counter()
         metrics |= _settings_metrics(present) | self.episodes.add(rollout)
         if rollout.restarts is not None:
@@ -253,7 +260,7 @@ class Agent:
         metrics["time/act_seconds"] = collected - begin - rollout.env_seconds
         metrics["time/update_seconds"] = self._update_seconds = finish - collected
         metrics["time/fps"] = rollout.steps / (finish - begin)
-        return metrics, rollout.episodes
+        return metrics, rollout
 
     def _log_ratio_limit(self, batch: Batch) -> float:
         """1e-5, times what rounding in float32 grows with: columns, the size of inputs, a small deviation;
@@ -327,11 +334,12 @@ class Agent:
                     f"The new environment has {name[:-7]}s {seen}; this policy was made for {expected}."
                 )
         old.close()
-        self.env, self.environments, self.fresh = env, fresh, True
+        self.env, self.environments = env, fresh
+        self.collector = self._collector()
+        self.forget_episodes()
         self.episodes = FinishedEpisodes()
-        self.collector = Collector(fresh, self.normalisers, self.sampling_rng)
         named = dataclasses.replace(free, env=fresh.spec_id)
-        self.settings = _resolved(named, fresh, self.engine.name, free.threads)
+        self.settings = resolved(named, fresh, self.engine.name, free.threads)
         return self
 
     def save(self, path: str | Path) -> Path:
@@ -341,24 +349,36 @@ class Agent:
         return checkpoint.save(Path(path), *self.snapshot())
 
     def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
-        """Everything that `restore` needs, as tensors and JSON. The tensors are not copied."""
+        """Everything that `restore` needs, as tensors and JSON. The tensors are not copied.
+
+        While a rollout is collected it is still the state at the end of the update before.
+        """
         tensors = self._learned()
+        at = self._before or self._present()
+        episodes, logs = at.episodes()
         state = {
             "settings": self.settings.to_json(),
             "steps": self.steps,
             "kl_beta": self.kl_beta,
             "rollbacks": self.rollbacks,
-            "environment_restarts": self.environments.restarts,
+            "environment_restarts": at.restarts,
             "finished_episodes": self.episodes.state(),
             "spaces": self._spaces(),
             "own_policy": self.policy.own is not None,
             "own_environment": self.env is not None and not isinstance(self.env, str),
-            "rng": {
-                "sampling": self.sampling_rng.bit_generator.state,
-                "update": self.update_rng.bit_generator.state,
-            },
+            "rng": at.rng,
+            "episodes": episodes,
         }
-        return tensors, state
+        return tensors | logs, state
+
+    def _present(self) -> Before:
+        rng = {"sampling": self.sampling_rng, "update": self.update_rng}
+        return Before(
+            rng={name: generator.bit_generator.state for name, generator in rng.items()},
+            restarts=self.environments.restarts,
+            boundary=None if self._fresh else self.collector.boundary(),
+            saved=self._saved,
+        )
 
     def _spaces(self) -> dict[str, list[str]]:
         environments = self.environments
@@ -392,28 +412,23 @@ class Agent:
         self.episodes.restore(state.get("finished_episodes", {}))  # missing in old runs
         self.sampling_rng.bit_generator.state = state["rng"]["sampling"]
         self.update_rng.bit_generator.state = state["rng"]["update"]
+        self._fresh, self._before = True, None
+        self._saved = (state.get("episodes"), {ACTIONS: tensors[ACTIONS]} if ACTIONS in tensors else {})
 
-    def resume_episodes(self, episodes: Any) -> Message | None:
-        """After `restore`: continue the episodes that ran at the checkpoint, ``episodes`` as
-        `Collector.state` gave them, where the environments can take their state. Otherwise new episodes
-        begin, as they do at this step in an uninterrupted run; the message, which is for people, states it.
+    def begin_episodes(self) -> list[str]:
+        """Unless episodes are running: continue those of the checkpoint that was restored. New ones begin
+        where there are none, or where they cannot be repeated, which the lines say.
         """
-        if not self.steps:
-            return None
-        if episodes is not None and self.environments.gives_state:
-            self.collector.restore(episodes)
-            self.fresh = False
-            return None
-        what = f"{self.environments.num_envs} environments begin new episodes at step {self.steps:,}"
-        if episodes is not None:
-            return Message(
-                f"{what}: the run's environments could give their state, these cannot; the end may differ.",
-                "warning",
-            )
-        seed = self.settings.seed
-        return Message(
-            f"{what}, with seeds of (seed {seed}, step), as on every point of the checkpoint grid."
-        )
+        if not self._fresh:
+            return []
+        saved, self._saved = self._saved, (None, {})
+        differences = begin(self.collector, saved, self.settings.seed, self.steps)
+        self._fresh = False
+        return differences
+
+    def forget_episodes(self) -> None:
+        """Begin new episodes with the next rollout."""
+        self._fresh, self._saved = True, (None, {})
 
     def roll_back(self, tensors: Tensors, state: dict[str, Any]) -> None:
         """Go back to a checkpoint of this agent, with random generators that depend on the seed, the step and
@@ -422,12 +437,14 @@ class Agent:
         rollbacks, restarts = self.rollbacks + 1, self.environments.restarts
         self.restore(tensors, state)
         self.rollbacks = rollbacks
-        self.fresh = True
         self.collector.count_from(restarts)
-        self.resume_episodes(state.get("episodes"))
         for k, rng in ((1, self.sampling_rng), (2, self.update_rng)):
             other = np.random.default_rng([self.settings.seed, k, self.steps, rollbacks])
             rng.bit_generator.state = other.bit_generator.state
+
+    def _collector(self) -> Collector:
+        limit = self.settings.replay_limit
+        return Collector(self.environments, self.normalisers, self.sampling_rng, limit)
 
     def close(self) -> None:
         """Close the environments, and end their workers and the engine's thread."""
@@ -456,21 +473,6 @@ class Reinforce(Agent):
 AGENTS: dict[str, type[Agent]] = {"ppo": PPO, "a2c": A2C, "reinforce": Reinforce}
 
 
-def _resolved(
-    settings: TrainSettings, environments: Environments, engine: str, threads: int | None
-) -> TrainSettings:
-    """The settings with every choice that was made, as settings.json holds them."""
-    given, workers = environments.backend == "given", environments.backend in ("mixed", "workers")
-    return dataclasses.replace(
-        settings,
-        num_envs=environments.num_envs,
-        vector_backend="auto" if given else environments.backend,
-        num_workers=environments.num_workers if workers else None,
-        engine=engine,
-        threads=threads,
-    )
-
-
 def _environments(env: Any, settings: TrainSettings) -> Environments:
     source = settings.env if env is None else env
     backend, workers, policy = settings.vector_backend, settings.num_workers, policy_of(settings)
@@ -482,6 +484,8 @@ def _environments(env: Any, settings: TrainSettings) -> Environments:
         env_kwargs=settings.env_kwargs,
         policy=policy,
         reading=Reading.of(settings),
+        reseed_after=settings.reseed_after,
+        carried=settings.carried,
     )
 
 

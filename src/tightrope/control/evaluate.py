@@ -12,6 +12,7 @@ from tightrope.control.environments import copies
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.seeds import EVALUATION
 from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.control.spaces.structure import Reading
@@ -53,7 +54,7 @@ def _evaluated(
     rows = environments.num_envs
     share = np.array([episodes // rows + (i < episodes % rows) for i in range(rows)])
     rng = None if deterministic else np.random.default_rng([seed, 3])
-    inputs, action_mask = environments.reset(seed)
+    inputs, action_mask = environments.reset(seed, EVALUATION)
     totals, lengths, waits = np.zeros(rows), np.zeros(rows, np.int64), np.zeros(rows, bool)
     found: list[tuple[float, int]] = []
     successes: list[float] = []
@@ -147,4 +148,6 @@ def evaluation_environments(env: Any, settings: TrainSettings, episodes: int) ->
             env_kwargs=None if isinstance(env, gym.Env) else settings.env_kwargs,
             policy=policy_of(settings),
             reading=Reading.of(settings),
+            reseed_after=settings.reseed_after,
+            carried=settings.carried,
         )

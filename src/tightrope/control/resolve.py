@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from tightrope.control.presets import BY_TASK, preset
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 
 if TYPE_CHECKING:
+    from tightrope.control.environments.base import Environments
     from tightrope.control.spaces.actions import ActionLayout
     from tightrope.control.spaces.observations import ObservationLayout
 
@@ -52,10 +52,8 @@ def resolve_with_preset(
     sizes = (merged["num_envs"], merged["num_steps"])
     if algorithm == "ppo" and "minibatch_size" not in values and all(type(size) is int for size in sizes):
         chosen["minibatch_size"] = max(1, min(chosen.get("minibatch_size", 64), sizes[0] * sizes[1]))
-    if limit is not None and "checkpoint_every" not in values:
-        total = {"total_steps": TrainSettings.total_steps, **merged}["total_steps"]
-        if type(total) is int and total > 0 and type(sizes[0]) is int:
-            chosen["checkpoint_every"] = _checkpoint_interval(limit * min(sizes[0], total) / total)
+    if env_id.startswith("ALE/"):  # a seeded reset loads the game anew, 80 ms
+        chosen["reseed_after"] = 8192
     settings = TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
     return settings, chosen
 
@@ -69,15 +67,6 @@ def anywhere(settings: TrainSettings, env: Any, **values: Any) -> TrainSettings:
     same = env == settings.env or (callable(env) and not isinstance(env, gym.Env))
     kept = settings.env_kwargs if same else None
     return dataclasses.replace(settings, vector_backend="auto", num_workers=None, env_kwargs=kept, **values)
-
-
-def _checkpoint_interval(episode: float) -> float:
-    """checkpoint_every: its default, or more where an episode is a larger share of the run.
-
-    ``episode`` is the longest episode in all copies as a share of the run. Environments are reset at
-    checkpoints, so the interval is long enough for an episode to end before.
-    """
-    return min(1.0, max(TrainSettings.checkpoint_every or 1.0, math.ceil(1000 * episode) / 1000))
 
 
 def _describe(env: Any, values: dict[str, Any]) -> tuple[str, int | None]:
@@ -153,3 +142,18 @@ def require_room(
 
 def _gigabytes(size: float) -> str:
     return f"{size / 1e9:,.1f} GB"
+
+
+def resolved(
+    settings: TrainSettings, environments: Environments, engine: str, threads: int | None
+) -> TrainSettings:
+    """The settings with every choice that was made, as settings.json holds them."""
+    given, workers = environments.backend == "given", environments.backend in ("mixed", "workers")
+    return dataclasses.replace(
+        settings,
+        num_envs=environments.num_envs,
+        vector_backend="auto" if given else environments.backend,
+        num_workers=environments.num_workers if workers else None,
+        engine=engine,
+        threads=threads,
+    )

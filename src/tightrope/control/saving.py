@@ -59,6 +59,8 @@ def load(
         agent.require_spaces(state)
         with checkpoint.understood(folder):
             agent.restore(tensors, state)
+        if env is not None and not own_environment:
+            agent.forget_episodes()  # a warm start on another task
     except BaseException:
         agent.close()
         raise

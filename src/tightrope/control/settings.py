@@ -97,6 +97,27 @@ class TrainSettings(Settings):
     )
     compile: bool = setting(False, "Torch path: compile the model with torch.compile.")
 
+    reseed_after: int | None = setting(
+        0,
+        "Steps after which a copy's next episode gets a seed of its own; none: only the first one does.",
+        at_least=0,
+        before=None,
+    )
+    carried: str | None = setting(
+        None,
+        "What the task keeps from episode to episode, like 1.obs_rms; none: a run looks at its start.",
+    )
+    repeats: str = setting(
+        "untested",
+        "Whether episodes repeat from seed and actions; a run tests it and writes it here.",
+        choices=("untested", "yes", "no"),
+    )
+    replay_limit: int = setting(
+        20_000,
+        "Steps of a copy that a resume repeats at most; a longer episode begins again there.",
+        at_least=0,
+    )
+
     on_env_fault: str = setting(
         "raise",
         "When an environment raises, hangs, dies or gives NaN: end the run, or make a new one and continue.",
@@ -134,7 +155,7 @@ class TrainSettings(Settings):
     )
     checkpoint_every: float | None = setting(
         0.05,
-        "Fraction of the run between checkpoints, where most environments are reset; none: by the clock.",
+        "Fraction of the run between checkpoints; none: by the clock.",
         above=0,
         at_most=1,
     )

@@ -9,15 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.environments.faults import EnvironmentFault, FailedEpisode
 from tightrope.control.environments.make import Environments
 from tightrope.control.evaluate import cut_text, evaluate_agent, evaluation_environments, step_limit
+from tightrope.control.repetition import Repetition
 from tightrope.control.resolve import resolve
+from tightrope.control.rollout.collector import BadNumbers
 from tightrope.control.saving import name_again, rebuild
-from tightrope.control.settings import EVALUATION_SEED, TrainSettings
+from tightrope.control.settings import TrainSettings
 from tightrope.runs import signals
-from tightrope.runs.checkpoint import step_of, understood
-from tightrope.runs.durable import CannotWrite
+from tightrope.runs.checkpoint import read_manifest, step_of, understood
+from tightrope.runs.durable import CannotWrite, present
 from tightrope.runs.folders import require_kind
+from tightrope.runs.records import write_json
 from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.training import loop
@@ -28,6 +32,8 @@ from tightrope.training.resume import continue_from, newest_point
 from tightrope.training.tensorboard import require_tensorboard
 
 __all__ = ["resolve", "resume", "train"]
+
+USUAL = 1_000  # steps of an episode that is not unusually long, where the task has no time limit
 
 
 @signals.stoppable()
@@ -84,9 +90,17 @@ def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, p
     point = newest_point(run, listeners)
     state: dict[str, Any] = {} if point is None else point.state
     with understood(run_dir if point is None else point.folder):
-        settings = TrainSettings.from_json(run.settings if point is None else state["settings"])
+        saved = run.settings if point is None else state["settings"]
+        settings = TrainSettings.from_json(saved)
         own_environment = bool(state.get("own_environment")) or ":" in settings.env
         own_policy = bool(state.get("own_policy"))
+    if "reseed_after" not in saved:
+        versions = {} if point is None else read_manifest(present(point.folder))["versions"]
+        raise ValueError(
+            f"{run_dir} was written by an earlier tightrope ({versions.get('tightrope', 'unknown')}), "
+            "whose checkpoints do not hold what an exact resume needs now: resume it with that version, or "
+            f"learn on from its policy in Python, tightrope.load({str(run_dir)!r}).learn(n)."
+        )
     if env is None and own_environment:
         raise ValueError(name_again(run_dir, settings.env, "resume"))
     if own_policy and policy is None:
@@ -126,7 +140,6 @@ class AgentLearner:
 
     def __init__(self, agent: Agent, run: Run, listeners: Listeners) -> None:
         self.agent = agent
-        self.settings = agent.settings
         self.changes = agent.changes
         self.run = run
         self.listeners = listeners
@@ -134,11 +147,18 @@ class AgentLearner:
         self.pending: Update | None = None
         self.best = -math.inf
         self.final: dict[str, float] = {}
+        self._told_of_long_episodes = False
+        self._repetition = Repetition(agent, run, listeners)
+        self._heard: int | None = 0  # when an episode last finished; None: it was told that none does
         self.merit = None  # the newest checkpoints are kept; the best policy has its own folder
         self._environments: Environments | None = None
-        self._first_state: Any = None
         self._told_of_cuts = False
         self._begin = (0, 0.0)
+
+    @property
+    def settings(self) -> TrainSettings:
+        """Those of the agent, with what the run found out."""
+        return self.agent.settings
 
     @property
     def position(self) -> int:
@@ -163,9 +183,17 @@ class AgentLearner:
     def begin(self) -> list[str]:
         """Make the environments for evaluation; the lines that describe engine and environments."""
         self._begin = (self.position, self.seconds)
+        if not self.position:
+            self._repetition.begin()
         if self.settings.evaluate_every is not None:
             self._open_evaluation()
         environments = self.agent.environments
+        if not (environments.replays or environments.gives_state):
+            self.listeners.info(
+                "These environments can neither be repeated from seeds and actions nor give their state: "
+                "when the run is resumed they begin new episodes, and its end has other bits than without a "
+                "break."
+            )
         workers = f" in {environments.num_workers} processes" if environments.num_workers > 1 else ""
         count = f"{environments.num_envs} x {self.settings.env}"
         return [self.agent.engine_line, f"environments: {count}, {environments.backend}{workers}"]
@@ -178,14 +206,45 @@ class AgentLearner:
         except ValueError as error:
             self.listeners.info(f"no evaluation while training: {error}")
             return
-        if self._environments.gives_state:
-            # a resumed run must see the same evaluations, whatever a copy keeps from one to the next
-            self._environments.reset(EVALUATION_SEED)
-            self._first_state = self._environments.get_state()
 
     def iterate(self) -> Iterator[Update]:
         """The agent's updates."""
-        return self.agent.iterate(self.total, start=0)
+        try:
+            for update in self.agent.iterate(self.total, start=0):
+                for episode in self.agent.failed:
+                    self.listeners.info(f"Environment {episode.copy} was restarted. {self._kept(episode)}")
+                self._tell_of_silence(update)
+                self._repetition.after_update()
+                yield update
+        except (EnvironmentFault, BadNumbers) as error:
+            if (failed := self.agent.collector.failed) is not None:
+                error.args = (f"{error}\n{self._kept(failed)}",)
+            raise
+
+    def _kept(self, episode: FailedEpisode) -> str:
+        """Write an episode that failed into the run folder; a sentence that says where."""
+        environments, number = self.agent.environments, len(list(self.run.path.glob("fault-*.json"))) + 1
+        path = self.run.path / f"fault-{number:04d}.json"
+        task = {"id": environments.spec_id, "kwargs": environments.keywords}
+        write_json(path, {**task, **episode._asdict()})
+        return (
+            f"{path} holds the seed and the actions of the episode; docs/faults.md repeats it in three lines."
+        )
+
+    def _tell_of_silence(self, update: Update) -> None:
+        """Once: that no episode has finished for a quarter of the run, and not because they are just long."""
+        if update.episodes and self._heard is not None:
+            self._heard = update.step
+        longest = int(self.agent.collector.boundary().lengths.max())
+        usual = self.agent.environments.max_episode_steps or USUAL
+        if self._heard is not None and update.step - self._heard > self.total / 4 and longest > usual:
+            since = f"since step {self._heard:,}" if self._heard else "so far"
+            self._heard = None
+            self.listeners.info(
+                f"No episode has finished {since}, at step {update.step:,}; the longest has run for "
+                f"{longest:,} steps. Returns are counted when an episode ends. If episodes should end, look "
+                "at when the task terminates, or give it a time limit (gymnasium.wrappers.TimeLimit)."
+            )
 
     def evaluate(self, update: Update | None) -> dict[str, float]:
         """The evaluation at points of its grid; the one at the end is `conclude`'s."""
@@ -205,8 +264,6 @@ class AgentLearner:
             return {}
         # restarts in evaluations must not count towards the limit: a resumed run does not know of them
         self._environments.count_from(0)
-        if self._first_state is not None:
-            self._environments.set_state(self._first_state)
         limit = step_limit(self.settings, self._environments, self.agent.episodes.longest)
         count = self.settings.evaluation_episodes
         result = evaluate_agent(self.agent, self._environments, count, max_steps=limit)
@@ -242,12 +299,16 @@ class AgentLearner:
 
     def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
         """The agent, the best evaluation, and the episodes that are running where they can be continued."""
+        self._repetition.before_save()
         tensors, state = self.agent.snapshot()
-        state |= {"best": self.best, "wall_seconds": self.seconds}
-        # after a rollout that was dropped new episodes begin
-        running = self.agent.steps and not self.agent.fresh
-        state["episodes"] = self.agent.collector.state() if running else None
-        return tensors, state
+        origins = (state["episodes"] or {}).get("origins", ())
+        if not self._told_of_long_episodes and any(steps < 0 for _, _, steps in origins):
+            self._told_of_long_episodes = True
+            self.listeners.info(
+                f"An episode is longer than replay_limit {self.settings.replay_limit:,}: it goes on, but a "
+                "resume begins a new one in that copy, and its end has other bits than without a break."
+            )
+        return tensors, {**state, "best": self.best, "wall_seconds": self.seconds}
 
     def restore(self, point: Checkpoint) -> None:
         """Put back a checkpoint. CheckpointError when it is not what an agent of these settings saved."""
@@ -259,9 +320,9 @@ class AgentLearner:
             best = point.state.get("best")
             self.best = -math.inf if best is None else float(best)
             self.seconds = float(point.state.get("wall_seconds", 0.0))
-            message = self.agent.resume_episodes(point.state.get("episodes"))
-        if message is not None:
-            self.listeners(message)
+            lines = self.agent.begin_episodes()
+        for line in lines:
+            self.listeners.warn(line)
 
     def roll_back(self, point: Checkpoint) -> None:
         """Put back a checkpoint of this run; the best policy stays."""

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from tightrope.metrics import table as metrics
-from tightrope.runs import checkpoint, durable, retention, signals, versions
+from tightrope.runs import checkpoint, durable, growing, retention, signals, versions
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import CannotWrite, sync_folder, writing
 from tightrope.runs.folders import fresh, require_free, why_not
@@ -47,6 +47,7 @@ class Run:
         self._files: dict[str, Recorder] = {}
         self._lock: WriterLock | None = None
         self._costs: dict[str, float] = {}
+        self._held: dict[str, int] | None = None  # rows of tensors that grow, see growing.py; None: not read
         self._new_name = False  # a record file was created and its name is not yet durable
 
     @classmethod
@@ -130,7 +131,16 @@ class Run:
         """Read the newest valid checkpoint, without the lock. Damaged ones are skipped with a
         warning. Raises CheckpointError.
         """
-        return retention.valid(self.checkpoints)
+        return self._with_growing(retention.valid(self.checkpoints))
+
+    def _with_growing(self, point: Checkpoint) -> Checkpoint:
+        """With the tensors that grow; a checkpoint of an older version, or without any, as it is."""
+        wanted = point.state.get("growing")
+        if not wanted:
+            return point
+        with checkpoint.understood(point.folder):
+            tensors = growing.gathered(read_lines(self.path / growing.FILE), wanted)
+        return point._replace(tensors={**point.tensors, growing.GROUP: tensors})
 
     def record(self, step: int, seconds: float, values: dict[str, float]) -> dict[str, float]:
         """Append the metrics of one update, and the cost of the checkpoint before it; returns both. Every
@@ -217,8 +227,12 @@ class Run:
         try:
             with writing(folder):
                 self._clean()
-                added = {"records": self._sync(), "merit": merit}
-                checkpoint.save(folder, tensors, {"settings": self.settings, **state, **added})
+                whole = {name: group for name, group in tensors.items() if name != growing.GROUP}
+                added: dict[str, Any] = {"merit": merit}
+                if growing.GROUP in tensors:
+                    added["growing"] = self._grow(tensors[growing.GROUP])
+                added["records"] = self._sync()
+                checkpoint.save(folder, whole, {"settings": self.settings, **state, **added})
                 self._read_back(folder)
         except CannotWrite as error:
             if final:
@@ -233,6 +247,14 @@ class Run:
         seconds = time.perf_counter() - clock
         self._costs = {"time/checkpoint_seconds": seconds, "time/checkpoint_megabytes": size / 1e6}
         return True
+
+    def _grow(self, tensors: dict[str, Tensor]) -> dict[str, int]:
+        """Append what is new of the tensors that grow; returns their lengths."""
+        if self._held is None:
+            self._held = growing.held_in(read_lines(self.path / growing.FILE))
+        self._append(growing.FILE, growing.lines(tensors, self._held))
+        self._held = growing.lengths(tensors)  # of others nothing will be asked again
+        return self._held
 
     def require_there(self) -> None:
         """CannotWrite when the folder was deleted or renamed: a save would make a part of it again."""
@@ -273,7 +295,7 @@ class Run:
         manifest = checkpoint.read_manifest(durable.present(point.folder))
         if changed := versions.version_changes(manifest.get("versions")):
             warn(f"{changed} since the checkpoint: the run continues, but its last bits may differ.")
-        return point
+        return self._with_growing(point)
 
     def _put_aside_a_damaged_best(self, warn: Callable[[str], None]) -> None:
         """Rename it so that it can be saved again: `checkpoint.save` replaces only valid checkpoints."""
@@ -302,6 +324,7 @@ class Run:
         """
         self.lock()
         self._close_files()
+        self._held = None
         with writing(self.path):
             self._clean()
             for folder in retention.steps_in(self.checkpoints):

@@ -24,7 +24,9 @@ class Update:
     """One update: the steps so far, the budget, every metric, and what was collected for it.
 
     ``before``: ``step`` before the update. ``on_grid``: it reached a point of the checkpoint grid, whether or
-    not anything is saved. ``episodes`` that ended: (return, length, terminated). ``samples``: rows of
+    not anything is saved. ``episodes`` that ended: (return, length, terminated), and ``seeds`` of each: (the
+    seed, 0), or the last one before it and how many episodes later it began; None: its copy has none of its
+    own. ``samples``: rows of
     samples.jsonl. ``pause``: seconds of it that were not training.
     """
 
@@ -36,6 +38,7 @@ class Update:
     episodes: list[tuple[float, int, bool]] = field(default_factory=list)
     samples: list[dict[str, Any]] = field(default_factory=list)
     pause: float = 0.0
+    seeds: list[tuple[int | None, int]] = field(default_factory=list)
 
 
 def update_of(saved: dict[str, Any]) -> Update:

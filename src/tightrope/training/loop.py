@@ -139,7 +139,9 @@ class _Loop:
         self._evaluated(step, found)
         with signals.uninterrupted():
             run.record_episodes(
-                {"step": step, "return": r, "length": n, "terminated": t} for r, n, t in update.episodes
+                {"step": step, "return": r, "length": n, "terminated": t, "seed": seed}
+                | ({"after": after} if after else {})
+                for (r, n, t), (seed, after) in zip(update.episodes, update.seeds, strict=True)
             )
             recorded = run.record(step, learner.seconds, metrics | found)
             run.record_samples(update.samples)

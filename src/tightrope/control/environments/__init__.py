@@ -1,3 +1,6 @@
 """Copies of a task behind reset and step."""
 
-__all__ = ["base", "copies", "faults", "make", "masks", "processes", "state", "tasks", "vector", "watchdog"]
+__all__ = [
+    "base", "copies", "faults", "make", "masks", "pool", "processes", "replay", "seeds", "state", "tasks",
+    "vector", "watchdog",
+]  # fmt: skip

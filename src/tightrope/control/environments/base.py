@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tightrope.control.environments.faults import FaultPolicy, Restarts
+from tightrope.control.environments.seeds import TRAINING, Seeding, Start
 from tightrope.control.spaces.actions import ActionLayout
 from tightrope.control.spaces.observations import ObservationLayout
-from tightrope.control.spaces.structure import Inputs
+from tightrope.control.spaces.structure import Inputs, Reading
 
 
 class Step(NamedTuple):
@@ -26,6 +28,7 @@ class Step(NamedTuple):
     final_inputs: Inputs | None = None  # [F, ...]: the true last observations of these rows
     cut: np.ndarray | None = None  # bool [B]: restarted after a fault; this step did not take place there
     success: np.ndarray | None = None  # float64 [B]: of episodes that ended here; NaN: not said (success.py)
+    origins: np.ndarray | None = None  # where an episode ended: the first two of `Environments.origins`
 
 
 class Environments(ABC):
@@ -38,8 +41,14 @@ class Environments(ABC):
     backend: str  # "serial" | "mixed" | "workers" | "vector" | "envpool" | "given"
     spec_id: str
     max_episode_steps: int | None
+    keywords: dict[str, Any] = {}  # noqa: RUF012 - with which gymnasium.make made them; never changed
     num_workers: int = 1
-    gives_state: bool  # whether the environments can give their state (see state.py)
+    reseed_after: int | None = None  # see Seeding
+    carried_names: Sequence[str] = ()
+    makers: Sequence[Any] = ()  # of single environments: one function a copy
+    reading: Reading
+    replays: bool = False  # single environments, whose episodes repeat from seed and actions
+    gives_state: bool = False  # a vector environment that can give its state (see state.py)
     num_envs: int
     observation_layout: ObservationLayout
     action_layout: ActionLayout
@@ -47,6 +56,7 @@ class Environments(ABC):
 
     def __init__(self, policy: FaultPolicy) -> None:
         self.policy = policy
+        self.seeding = Seeding(0)
         self._restarts = Restarts(policy)
 
     @property
@@ -54,12 +64,19 @@ class Environments(ABC):
         """How often an environment, or a process of them, was restarted after a fault."""
         return self._restarts.count
 
-    @abstractmethod
-    def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
+    def reset(
+        self, seed: int, stream: int = TRAINING, starts: Sequence[Start] | None = None
+    ) -> tuple[Inputs, np.ndarray | None]:
         """Reset all: the first inputs and action masks.
 
-        Single environment i gets the seed ``seed + i``, a vector environment ``seed``.
+        ``seed`` of the run and ``stream`` decide the seeds of all episodes (see Seeding); a vector
+        environment gets those of copy 0. ``starts``: one a copy; None: each begins with its episode 0.
         """
+        self.seeding = Seeding(seed, stream, self.reseed_after, self.carried_names)
+        return self._reset(starts)
+
+    @abstractmethod
+    def _reset(self, starts: Sequence[Start] | None) -> tuple[Inputs, np.ndarray | None]: ...
 
     def step(self, actions: np.ndarray) -> Step:
         """Act in every environment; ``actions`` [B, A] float32 as sampled, bounds are handled here."""
@@ -75,24 +92,29 @@ class Environments(ABC):
     def receive(self) -> Step:
         """Finish the step; the actions of every row group must have been sent, in order."""
 
-    @abstractmethod
-    def get_state(self) -> dict[str, Any]:
-        """The state in the middle of episodes, as JSON can hold it; EnvironmentFault when it cannot."""
+    def renew(self, row: int, wait: int) -> tuple[Inputs, np.ndarray | None]:
+        """Begin the next episode in one row, which then waits; returns what `reset` returned."""
+        raise NotImplementedError
 
-    def set_state(self, state: dict[str, Any]) -> tuple[Inputs, np.ndarray | None]:
-        """Reset, and continue from a state of `get_state`. Returns what `reset` returned.
-
-        ValueError for a seed that no run has.
+    def origins(self) -> np.ndarray | None:
+        """int64 [B, 3]: the episode of each copy's last seeded reset, how many others began since, and the
+        steps since. None for vector environments, which are seeded as a whole.
         """
-        seed = state["seed"]
-        if not isinstance(seed, int) or not 0 <= seed < 2**63:
-            raise ValueError(f"the seed of the episodes is {str(seed)[:80]}")
-        first = self.reset(seed)
-        self._set_state(state)
-        return first
+        return None
 
-    @abstractmethod
-    def _set_state(self, state: dict[str, Any]) -> None: ...
+    def carried(self) -> list[Any] | None:
+        """What each copy had carried from earlier episodes at its last seeded reset, encoded; None where no
+        copy carries anything.
+        """
+        return None
+
+    def get_state(self) -> Any:
+        """The state of a vector environment that gives it, in the middle of episodes."""
+        raise NotImplementedError
+
+    def set_state(self, state: Any) -> None:
+        """Continue from a state of `get_state`, after a reset."""
+        raise NotImplementedError
 
     def count_from(self, restarts: int) -> None:
         """Start the restart counter at ``restarts``."""

@@ -54,6 +54,18 @@ class EnvironmentFault(TightropeError, RuntimeError):
         return {name: value for name, value in dataclasses.asdict(self).items() if name != "lost"}
 
 
+class FailedEpisode(NamedTuple):
+    """The episode of a copy that failed: the seed of its last seeded reset, how many episodes began since,
+    what the copy carried, and its actions since, as the environment got them, the failing one last.
+    """
+
+    copy: int
+    seed: int
+    after: int
+    carried: Any
+    actions: list[Any]
+
+
 class ApiBreak(TightropeError):
     """An environment returned what Gymnasium's API does not allow; becomes an EnvironmentFault.
 
@@ -135,16 +147,6 @@ class Restarts:
             "the environment, or allow more."
         )
         return dataclasses.replace(fault, message=message, lost=False)
-
-
-def restart_seed(seed: int, restarts: int, index: int) -> int:
-    """The seed of environment ``index`` after its n-th restart since all were reset with ``seed``."""
-    return int(np.random.SeedSequence([seed, restarts, index]).generate_state(1)[0])
-
-
-def seed_of(seed: int, restarts: int, index: int) -> int:
-    """The seed of environment ``index``: ``seed + index`` until its first restart."""
-    return restart_seed(seed, restarts, index) if restarts else seed + index
 
 
 def pause(restarts: int, timeout: float | None) -> float:

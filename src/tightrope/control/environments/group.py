@@ -27,13 +27,12 @@ from tightrope.control.environments.faults import (
     check_finite,
     explained,
     kind_of,
-    raise_signal,
-    seed_of,
     wait_before_restart,
 )
 from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, find_source
+from tightrope.control.environments.seeds import Seeding, Start
 from tightrope.control.environments.success import success_of
-from tightrope.control.environments.tasks import check_alike, close_environment, make_all
+from tightrope.control.environments.tasks import check_alike, close_environment, make_all, renew_world
 from tightrope.control.environments.watchdog import limited
 from tightrope.control.spaces.actions import ActionLayout, action_layout
 from tightrope.control.spaces.observations import ObservationLayout, observation_layout
@@ -58,6 +57,9 @@ class StepBuffers:
     masks: np.ndarray  # bool [N, L]
     cut: np.ndarray  # bool [N]: restarted in this step
     restarts: np.ndarray  # int64 [N]: since all were reset
+    origins: (
+        np.ndarray
+    )  # int64 [N, 3]: episode of the last seeded reset, others since, the count of steps then
     current: np.ndarray  # int64 [N]: in the first place of a group the row that it is stepping, else -1
 
     @classmethod
@@ -80,6 +82,7 @@ class StepBuffers:
             masks=zeros((num, actions.num_logits), np.bool_),
             cut=zeros((num,), np.bool_),
             restarts=zeros((num,), np.int64),
+            origins=zeros((num, 3), np.int64),
             current=zeros((num,), np.int64),
         )
 
@@ -99,6 +102,8 @@ class StepBuffers:
         success = None
         if rows is not None or self.terminated.any():
             success = np.where(self.terminated | self.truncated, self.success, np.nan)
+        cut = self.cut.copy() if self.cut.any() else None
+        new = rows is not None or cut is not None or self.terminated.any()
         return Step(
             inputs={name: array.copy() for name, array in self.inputs.items()},
             action_mask=self.masks.copy() if has_masks else None,
@@ -107,7 +112,8 @@ class StepBuffers:
             truncated=self.truncated.copy(),
             final_rows=rows,
             final_inputs=None if rows is None else {k: array[rows] for k, array in self.final_inputs.items()},
-            cut=self.cut.copy() if self.cut.any() else None,
+            cut=cut,
+            origins=self.origins.copy() if new else None,
             success=success,
         )
 
@@ -151,30 +157,39 @@ class EnvGroup:
         self._rows = [{k: a[i : i + 1] for k, a in buffers.inputs.items()} for i in range(len(envs))]
         self._finals = [{k: a[i : i + 1] for k, a in buffers.final_inputs.items()} for i in range(len(envs))]
         self._flat_rows = [row["flat"][0] for row in self._rows] if self._plain else []
-        self._seed = 0
+        self._seeding = Seeding(0)
+        self._clean: list[Any] = [None] * len(envs)  # what they carry before their first episode
+        self.carried: list[Any] = [None] * len(envs)  # see `Environments.carried`
         self._count = 0  # steps since the last reset of all
         self._calls = 0  # steps and resets that have begun
         self._checked = False  # the first step is checked closely
         self._dirty = True  # a flag may be set
         buffers.current.fill(-1)
 
-    def reset(self, seed: int) -> None:
-        """Reset all; environment i (counted over all groups) gets the seed ``seed + i``."""
-        self._seed = seed
-        self._count = 0
+    def reset(self, seeding: Seeding, starts: Sequence[Start] | None = None, count: int = 0) -> None:
+        """Reset all; the steps are counted from ``count`` on. See `Environments.reset`."""
+        self._seeding = seeding
+        self._count = count
         self._checked = False
         self._dirty = True
         self.buffers.masks.fill(True)
         self.buffers.cut.fill(False)
         if self.worker:
-            generators.seed(seed, self.first)
+            generators.seed(seeding.run, self.first)
         try:
             for row in range(len(self.envs)):
                 try:
-                    self._begin(row)
+                    self._begin(row, Start() if starts is None else starts[row])
                 except RAISED as error:
                     self._restart(row, error)
             self._check_masks()
+        finally:
+            self.buffers.current[0] = -1
+
+    def renew(self, row: int, wait: int) -> None:
+        """Begin the next episode in one row, which then waits for ``wait`` steps."""
+        try:
+            self._begin(row, Start(self._next_episode(row), wait))
         finally:
             self.buffers.current[0] = -1
 
@@ -201,14 +216,18 @@ class EnvGroup:
         row = int(self.buffers.current[0])
         return None if row < 0 else self._calls * len(self.envs) + row
 
-    def _begin(self, row: int) -> None:
-        """Reset one environment with its seed."""
+    def _begin(self, row: int, start: Start) -> None:
+        """Reset one environment with the seed of an episode."""
+        env = self.envs[row] = _awake(self.envs[row])
         self._calls += 1
         self.buffers.current[0] = row
-        seed = self._seed_of(row)
-        if len(self.envs) == 1:  # what it draws from the global generators is then its own
-            generators.seed(seed)
-        observation, info = _check_reset(self.envs[row].reset(seed=seed))
+        self.buffers.origins[row] = (start.episode, 0, self._count + start.wait)
+        names = self._seeding.carried
+        if self._seeding.reseed_after is not None and (names or states.gives_state(env)):
+            if self._clean[row] is None:
+                self._clean[row] = states.clean(env, names, self._seed_of(row))
+            states.give(env, start.carried or self._clean[row], self._seed_of(row))
+        observation, info = _check_reset(self._seeded_reset(row))
         self._plain &= isinstance(observation, np.ndarray)
         self.observation_layout.write(observation, self._rows[row])
         if self.policy.restart:
@@ -216,6 +235,24 @@ class EnvGroup:
         self._find_mask(row, info)
         if self.has_masks:
             self._store_mask(row, observation, info)
+        if start.wait:
+            waiting: Any = _Waiting(self.envs, row, (observation, info), start.wait)
+            self.envs[row] = waiting
+
+    def _seeded_reset(self, row: int) -> tuple[Any, dict[str, Any]]:
+        """Reset with the seed of the episode; an episode is a function of it and of what is carried."""
+        env = self.envs[row]
+        if self._clean[row] is not None:
+            self.carried[row] = states.take(env, self._seeding.carried)
+        renew_world(env)
+        seed = self._seed_of(row)
+        if len(self.envs) == 1:  # what it draws from the global generators is then its own
+            generators.seed(seed)
+        return env.reset(seed=seed)
+
+    def _next_episode(self, row: int) -> int:
+        episode, after, _ = self.buffers.origins[row].tolist()
+        return int(episode + after + 1)
 
     def _step_from(self, begin: int, actions: Iterator[Any]) -> int:
         """Step from row ``begin`` on; the row to continue from, behind one that was restarted."""
@@ -275,8 +312,12 @@ class EnvGroup:
             if self.policy.restart:
                 self._check_row(self._finals[row], "final observation")
             self.buffers.truncated[row] = True
-        observation, info = self.envs[row].reset()
-        return observation, info
+        episode, after, begun = self.buffers.origins[row].tolist()
+        if not self._seeding.due(self._count - begun):
+            self.buffers.origins[row, 1] += 1
+            return self.envs[row].reset()
+        self.buffers.origins[row] = (episode + after + 1, 0, self._count)
+        return self._seeded_reset(row)
 
     @staticmethod
     def _check_row(inputs: Inputs, what: str) -> None:
@@ -321,7 +362,7 @@ class EnvGroup:
             buffers.restarts[row] += 1
             wait_before_restart(int(buffers.restarts[row]), self.policy)
             self._replace(row)
-            self._begin(row)
+            self._begin(row, Start(self._next_episode(row)))
 
         self.restarts.until_it_works(fault, attempt, lambda again: self._fault(row, again))
         if not complete and self._count:
@@ -331,17 +372,18 @@ class EnvGroup:
 
     def _replace(self, row: int) -> None:
         """Make another environment for a row; an instance that the user gave stays and is reset."""
-        old = self.envs[row]
+        old = _awake(self.envs[row])
         fresh: list[gym.Env] = []
         make_all(self.makers[row : row + 1], fresh, self.first + row, self._limit)
         check_alike(fresh, self.observation_layout, self.action_layout, self.name)
         if fresh[0] is not old:
             with contextlib.suppress(EnvironmentFault):
                 close_environment(old, self.first + row, self._limit)
+            self._clean[row] = None
         self.envs[row] = fresh[0]
 
     def _seed_of(self, row: int) -> int:
-        return seed_of(self._seed, int(self.buffers.restarts[row]), self.first + row)
+        return self._seeding.seed(self.first + row, int(self.buffers.origins[row, 0]))
 
     def _fault(self, row: int, error: BaseException) -> EnvironmentFault:
         action = None
@@ -359,35 +401,26 @@ class EnvGroup:
             action=action,
         )
 
-    # ------------------------------------------------------------------------------------------------- state
 
-    def get_state(self) -> list[Any]:
-        """The packed state of every environment (see state.py)."""
-        return [self._state_call(row, states.saved_state, env) for row, env in enumerate(self.envs)]
+class _Waiting:
+    """Stands in the place of an environment that has been reset, until it was stepped ``steps`` times."""
 
-    def set_state(self, found: list[Any]) -> None:
-        """Put packed states back into environments that have been reset."""
-        for row, (env, state) in enumerate(zip(self.envs, found, strict=True)):
-            self._state_call(row, states.restore_state, env, state)
+    def __init__(self, envs: list[Any], row: int, reset: tuple[Any, dict[str, Any]], steps: int) -> None:
+        self.env, self._envs, self._row, self._reset, self._left = envs[row], envs, row, reset, steps
 
-    def _state_call(self, row: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        self._calls += 1
-        self.buffers.current[0] = row
-        try:
-            return function(*arguments)
-        except RAISED as error:
-            raise_signal(error)
-            index = self.first + row
-            raise EnvironmentFault(
-                f"the state of environment {index} ({self.name}) cannot be kept: {type(error).__name__}: "
-                f"{error}.",
-                index,
-                self._count,
-                env_id=self.name,
-                worker=self.worker,
-            ) from error
-        finally:
-            self.buffers.current[0] = -1
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if not self._left:
+            self._envs[self._row] = self.env
+            return self.env.step(action)
+        self._left -= 1
+        return self._reset[0], 0.0, False, False, self._reset[1]
+
+    def close(self) -> None:
+        self.env.close()
+
+
+def _awake(env: Any) -> Any:
+    return env.env if isinstance(env, _Waiting) else env
 
 
 def _check_reset(result: Any) -> tuple[Any, dict[str, Any]]:

@@ -69,11 +69,14 @@ def make_environments(
     env_kwargs: Mapping[str, Any] | None = None,
     policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
     reading: Reading = Reading(),  # noqa: B008
+    reseed_after: int | None = None,
+    carried: str | None = None,
 ) -> Environments:
     """``num_envs`` environments from a Gymnasium id, an instance, a factory, or a vector environment.
 
     ``num_envs`` None: 1, or what the vector environment has. ``env_kwargs``: for the constructor. A given
     instance or vector environment is stepped but never closed. ``policy``: what happens after a fault.
+    ``reseed_after``, ``carried``: see Seeding.
     ValueError: an unknown id, a backend that the task does not have, an instance that cannot be replicated,
     spaces that are not supported or cannot be read as ``reading`` asks.
     """
@@ -107,6 +110,7 @@ def make_environments(
             )
             environments.spec_id = env if isinstance(env, str) else environments.spec_id
     environments.backend, environments.num_workers = chosen
+    environments.reseed_after, environments.carried_names = reseed_after, (carried or "").split()
     return environments
 
 

@@ -20,33 +20,31 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 import gymnasium as gym
 import numpy as np
 
-from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments, Step
 from tightrope.control.environments.faults import (
     RAISED,
     EnvironmentFault,
     FaultPolicy,
     action_text,
-    seed_of,
     wait_before_restart,
 )
 from tightrope.control.environments.group import EnvGroup, StepBuffers
 from tightrope.control.environments.processes import (
     BROKEN,
+    CARRIED,
     CLOSE,
     COMMAND,
     ENDED,
-    GET_STATE,
     MASKED,
     READY,
+    RENEW,
     RESET,
-    SET_STATE,
     SETTLE,
     SETTLED,
     SPIN,
@@ -60,6 +58,8 @@ from tightrope.control.environments.processes import (
     receive_soon,
     start_context,
 )
+from tightrope.control.environments.seeds import Seeding, Start
+from tightrope.control.environments.state import gives_state
 from tightrope.control.environments.tasks import check_alike, close_environment, make_all
 from tightrope.control.environments.watchdog import Watchdog, limited
 from tightrope.control.spaces.actions import action_layout
@@ -73,7 +73,7 @@ class EnvironmentPool(Environments):
     """B single environments in ``num_groups`` processes; ``here``: this one is the first of them. Neither
     changes a bit.
 
-    ``makers``: one zero-argument function per environment; environment i is seeded with seed + i.
+    ``makers``: one zero-argument function per environment.
     ``keep_first``: the caller closes environment 0.
     After a fault an environment that raised is restarted where it was; when a process died or hung, all of
     that process are.
@@ -92,11 +92,10 @@ class EnvironmentPool(Environments):
     ) -> None:
         super().__init__(policy)
         self.name = name
-        self._reading = reading
+        self.reading = reading
         self.num_envs = len(makers)
-        self._makers = makers
+        self.makers = makers
         self._keep = 1 if keep_first else 0
-        self._seed = 0
         self._count = 0  # steps since the last reset of all
         self._restarts_seen = 0  # of those in the buffers, how many the counter holds
         self._under_way = False  # a reset or a step, until every worker has answered
@@ -141,11 +140,12 @@ class EnvironmentPool(Environments):
         spec = envs[0].spec
         self.spec_id = spec.id if spec is not None else type(envs[0].unwrapped).__name__
         self.max_episode_steps = getattr(spec, "max_episode_steps", None)
+        self.keywords = {} if spec is None else dict(spec.kwargs)
         self.observation_layout = observation_layout(
-            envs[0].observation_space, self._reading.encoder, self._reading.keys
+            envs[0].observation_space, self.reading.encoder, self.reading.keys
         )
-        self.action_layout = action_layout(envs[0].action_space, self._reading.action_bounds)
-        self.gives_state = states.gives_state(envs[0])
+        self.action_layout = action_layout(envs[0].action_space, self.reading.action_bounds)
+        self.gives_own_state = gives_state(envs[0])
         check_alike(envs, self.observation_layout, self.action_layout, self.name)
 
     def _allocate(self, *, shared: bool) -> None:
@@ -163,15 +163,18 @@ class EnvironmentPool(Environments):
         """Start the process of group ``number``."""
         first, last = self._bounds[number : number + 2]
         spin = SPIN if len(self._bounds) - 1 <= available_cores() else 0.0
-        makers, entropy = self._makers[first:last], (self._entropy, number, self.restarts)
-        more = (self.name, spin, self.policy, self._reading, entropy)
+        makers, entropy = self.makers[first:last], (self._entropy, number, self.restarts)
+        more = (self.name, spin, self.policy, self.reading, entropy)
         return WorkerProcess(self._context, _serve, makers, self._shared, first, number, *more)
 
-    def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
+    @property
+    def replays(self) -> bool:  # type: ignore[override]
         """See Environments."""
+        return self.reseed_after is not None
+
+    def _reset(self, starts: Sequence[Start] | None) -> tuple[Inputs, np.ndarray | None]:
         if self._watchdog is not None:
             self._watchdog.start()
-        self._seed = seed
         self._count = 0
         self._restarts_seen = 0
         self._buffers.restarts.fill(0)
@@ -179,12 +182,29 @@ class EnvironmentPool(Environments):
             for worker in self._workers:
                 worker.settle()
         self._under_way = True
-        for worker in self._workers:
-            worker.send(RESET, seed)
+        starts = [Start()] * self.num_envs if starts is None else starts
+        for worker, (first, last) in zip(self._workers, itertools.pairwise(self._bounds[1:]), strict=True):
+            worker.send(RESET, self.seeding, starts[first:last], 0)
         if self._group is not None:
-            self._group.reset(seed)
+            self._group.reset(self.seeding, starts[: self._bounds[1]])
+        return self._first()
+
+    def _first(self) -> tuple[Inputs, np.ndarray | None]:
+        """What the resets that are under way return."""
         self._has_masks = self._await_workers() or (self._group is not None and self._group.has_masks)
         self._under_way = False
+        step = self._buffers.step(self._has_masks)
+        return step.inputs, step.action_mask
+
+    def renew(self, row: int, wait: int) -> tuple[Inputs, np.ndarray | None]:
+        """See Environments."""
+        number = self.worker_of(row)
+        if number:
+            worker = self._workers[number - 1]
+            worker.send(RENEW, row - worker.first, wait)
+            self._reply(number - 1)
+        elif self._group is not None:
+            self._group.renew(row, wait)
         step = self._buffers.step(self._has_masks)
         return step.inputs, step.action_mask
 
@@ -205,42 +225,28 @@ class EnvironmentPool(Environments):
         self._under_way = False
         return self._buffers.step(self._has_masks)
 
-    # ------------------------------------------------------------------------------------------------- state
-
-    def get_state(self) -> dict[str, Any]:
+    def origins(self) -> np.ndarray:
         """See Environments."""
-        with self._no_restart():
-            for worker in self._workers:
-                worker.send(GET_STATE)
-            found = [] if self._group is None else self._group.get_state()
-            for worker in self._workers:
-                worker.wait()
-                found += worker.states()
-        return {"seed": self._seed, "renewals": self._buffers.restarts.tolist(), "states": found}
+        found = self._buffers.origins.copy()
+        found[:, 2] = self._count - found[:, 2]
+        return found
 
-    def _set_state(self, state: dict[str, Any]) -> None:
-        self._buffers.restarts[:] = state["renewals"]
-        self._restarts_seen = sum(state["renewals"])
-        found = state["states"]
-        with self._no_restart():
-            if self._group is not None:
-                self._group.set_state(found[: self._bounds[1]])
-            for worker, (first, last) in zip(
-                self._workers, itertools.pairwise(self._bounds[1:]), strict=True
-            ):
-                data = json.dumps(found[first:last], allow_nan=False).encode()
-                worker.send(SET_STATE, len(data), data)
-                worker.wait()
-
-    @contextlib.contextmanager
-    def _no_restart(self) -> Iterator[None]:
-        """A fault inside ends the run: an environment that was restarted would be in another state."""
+    def carried(self) -> list[Any] | None:
+        """See Environments."""
+        if not (self.gives_own_state or self.carried_names):
+            return None
+        for worker in self._workers:
+            worker.send(CARRIED)
+        found = [] if self._group is None else list(self._group.carried)
         try:
-            yield
+            for worker in self._workers:
+                worker.wait()
+                found += worker.carried()
         except EnvironmentFault as fault:
             if not fault.lost:
                 raise
             raise self._described(self._workers[fault.worker - 1], fault, "keeping the state of") from fault
+        return found
 
     # ------------------------------------------------------------------------------------------------ faults
 
@@ -286,7 +292,9 @@ class EnvironmentPool(Environments):
             wait_before_restart(int(buffers.restarts[rows.start]), self.policy)
             fresh = self._workers[place] = self._start(place + 1)
             fresh.wait_until_built()
-            fresh.send(RESET, self._seed)
+            origins = buffers.origins[rows]
+            starts = [Start(int(episode)) for episode in origins[:, 0] + origins[:, 1] + 1]
+            fresh.send(RESET, self.seeding, starts, self._count)
             return fresh.wait()
 
         def explain(error: BaseException) -> EnvironmentFault:
@@ -327,7 +335,7 @@ class EnvironmentPool(Environments):
 
     def seed_of(self, row: int) -> int:
         """See Environments."""
-        return seed_of(self._seed, int(self._buffers.restarts[row]), row)
+        return self.seeding.seed(row, int(self._buffers.origins[row, 0]))
 
     def worker_of(self, row: int) -> int:
         """See Environments."""
@@ -439,15 +447,17 @@ def _obey(channel: socket.socket, group: EnvGroup, spin: float) -> bytes | None:
     message = receive_soon(channel, COMMAND.size, spin)
     if len(message) < COMMAND.size:
         return None  # the main process is gone
-    command, number = COMMAND.unpack(message)
+    command, length = COMMAND.unpack(message)
+    arguments = json.loads(receive_all(channel, length)) if length else []
     if command == RESET:
-        group.reset(number)
+        seeding, starts, count = arguments
+        group.reset(Seeding(*seeding), [Start(*start) for start in starts], count)
+    elif command == RENEW:
+        group.renew(*arguments)
     elif command == STEP:
         group.step()
-    elif command == SET_STATE:
-        group.set_state(json.loads(receive_all(channel, number)))
-    elif command == GET_STATE:
-        return pack_json(group.get_state())
+    elif command == CARRIED:
+        return pack_json(group.carried)
     elif command == SETTLE:
         return SETTLED
     return None if command == CLOSE else b""

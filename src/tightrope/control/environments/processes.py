@@ -1,7 +1,7 @@
 """Worker processes as the main process sees them, and the channel between the two.
 
-Arrays are shared memory. A socket carries fixed-size commands and replies, and JSON text for the states of
-environments and for a fault.
+Arrays are shared memory. A socket carries fixed-size commands and replies, and JSON text for seeds, for what
+environments carry from episode to episode, and for a fault.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ from typing import Any, NoReturn
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy
+from tightrope.control.environments.faults import RAISED, EnvironmentFault, FaultPolicy
 from tightrope.runs.durable import spare_standard_streams
 
-COMMAND = struct.Struct("<cq")  # one of the following, and a number: a seed, or how many bytes of data follow
-RESET, STEP, GET_STATE, SET_STATE, SETTLE, CLOSE = b"r", b"s", b"g", b"p", b"t", b"c"
+COMMAND = struct.Struct("<cq")  # one of the following, and how many bytes of data follow
+RESET, RENEW, STEP, CARRIED, SETTLE, CLOSE = b"r", b"n", b"s", b"g", b"t", b"c"
 LENGTH = struct.Struct("<Q")
 # replies: done; done, and there are action masks; a fault follows; all environments are closed
 READY, MASKED, BROKEN, ENDED = b"k", b"m", b"e", b"x"
 TO_START = 60.0  # seconds at least for a worker that is not forked: it imports everything again
 SETTLED = b"t"  # follows the reply to SETTLE, and no other
+LONGEST_ANSWER = 600.0  # seconds for an answer of `in_process_of_its_own`
 SPIN = 2e-4  # seconds to poll for a message before sleeping; waking up costs about as much as a step
 
 _yield_core: Callable[[], Any] = getattr(os, "sched_yield", int)  # int() where there is nothing to call
@@ -124,11 +125,12 @@ class WorkerProcess:
                 ) from error
         theirs.close()
 
-    def send(self, command: bytes, number: int = 0, data: bytes = b"") -> None:
-        """Wake the worker; `wait` finds out if it is gone."""
+    def send(self, command: bytes, *arguments: Any) -> None:
+        """Wake the worker; `wait` finds out if it is gone. ``arguments``: JSON."""
         self._owes |= command != CLOSE
+        data = json.dumps(arguments, allow_nan=False).encode() if arguments else b""
         with contextlib.suppress(OSError):
-            self._socket.sendall(COMMAND.pack(command, number) + data)
+            self._socket.sendall(COMMAND.pack(command, len(data)) + data)
 
     def wait(self) -> bool:
         """Wait for the reply; True when the environments give action masks.
@@ -195,8 +197,8 @@ class WorkerProcess:
         except (OSError, EnvironmentFault):  # it was gone before
             return None
 
-    def states(self) -> Any:
-        """The packed states that follow the reply to GET_STATE. EnvironmentFault as `wait`."""
+    def carried(self) -> Any:
+        """What follows the reply to CARRIED. EnvironmentFault as `wait`."""
         try:
             return self._receive_json()
         except OSError as error:
@@ -334,3 +336,38 @@ def close_inherited() -> None:
     """In a forked worker: close the main process's ends, which would hide the main process's death."""
     for inherited in list(_parent_ends):
         inherited.close()
+
+
+def in_process_of_its_own(function: Callable[[], Any]) -> Any:
+    """What a function returns in a process of its own. ValueError: it raised, died or hung there."""
+    ours, theirs = socket.socketpair()
+    ours.settimeout(LONGEST_ANSWER)
+    process = start_context().Process(  # type: ignore[attr-defined]
+        target=_answer, args=(CloudpickleWrapper(function), theirs), daemon=True, name="tightrope-twin"
+    )
+    process.start()
+    theirs.close()
+    try:
+        (length,) = LENGTH.unpack(receive_all(ours, LENGTH.size))
+        found, error = json.loads(receive_all(ours, length))
+    except (OSError, EOFError) as gone:
+        process.kill()
+        raise ValueError(f"the process with a second copy was lost ({gone})") from gone
+    finally:
+        ours.close()
+        process.join()
+    if error:
+        raise ValueError(error)
+    return found
+
+
+def _answer(function: Any, channel: socket.socket) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    close_inherited()
+    try:
+        answer = (function.fn(), "")
+    except RAISED as error:
+        answer = (None, f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
+    with contextlib.suppress(OSError):
+        channel.sendall(pack_json(answer))

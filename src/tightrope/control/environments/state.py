@@ -1,4 +1,5 @@
-"""The state of environments that can give it, as JSON; nothing is pickled.
+"""The state of environments that can give it, and what others keep from one episode to the next, as JSON;
+nothing is pickled.
 
 An environment takes part by two methods: ``get_state()`` returns what it is in the middle of, made of None,
 numbers, strings, bytes, lists, dicts with string keys and numpy arrays; ``set_state(state)`` continues from
@@ -9,7 +10,11 @@ both methods; they must then cover everything inside the wrapper.
 from __future__ import annotations
 
 import base64
+import copy
 import math
+import random
+from collections import deque
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -81,6 +86,8 @@ def _stateful(env: Any) -> tuple[list[TimeLimit], Any] | None:
     a wrapper outside it may have a state.
     """
     limits: list[TimeLimit] = []
+    if _is_cartpoles(env):
+        return limits, _CartPoles(env.unwrapped)
     while not (callable(getattr(env, GET, None)) and callable(getattr(env, SET, None))):
         if isinstance(env, TimeLimit):
             limits.append(env)
@@ -90,13 +97,21 @@ def _stateful(env: Any) -> tuple[list[TimeLimit], Any] | None:
     return limits, env
 
 
+def _is_cartpoles(env: Any) -> bool:
+    kind = type(getattr(env, "unwrapped", env))
+    return (kind.__module__, kind.__name__) == (
+        "gymnasium.envs.classic_control.cartpole",
+        "CartPoleVectorEnv",
+    )
+
+
 def gives_state(env: Any) -> bool:
     """Whether a single or a vector environment can give its state."""
     return _stateful(env) is not None
 
 
 def saved_state(env: Any) -> Any:
-    """The encoded state of an environment that gives one. TypeError as `encode`."""
+    """A copy of the state of an environment that gives one, for `encode`."""
     layers = _stateful(env)
     assert layers is not None
     limits, layer = layers
@@ -104,17 +119,162 @@ def saved_state(env: Any) -> Any:
     rng = getattr(env.unwrapped, "_np_random", None) if isinstance(env, gym.Env) else None
     if isinstance(rng, np.random.Generator):
         found["rng"] = rng.bit_generator.state
-    return encode(found)
+    return copy.deepcopy(found)
 
 
-def restore_state(env: Any, encoded: Any) -> None:
+def restore_state(env: Any, state: Any) -> None:
     """Give an environment, which has been reset, the state that `saved_state` found."""
-    layers, state = _stateful(env), decode(encoded)
+    layers = _stateful(env)
     assert layers is not None
     limits, layer = layers
     layer.set_state(state["own"])
-    # "elapsed" is missing for vector environments of older runs
-    for limit, elapsed in zip(limits, state.get("elapsed", ()), strict=True):
+    for limit, elapsed in zip(limits, state["elapsed"], strict=True):
         limit._elapsed_steps = elapsed
     if "rng" in state:
         env.unwrapped.np_random.bit_generator.state = state["rng"]
+
+
+class _CartPoles:
+    """The state of Gymnasium's vector version of CartPole: arrays and a generator."""
+
+    NAMES = ("state", "steps", "prev_done", "low", "high")
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+
+    def get_state(self) -> dict[str, Any]:
+        """See `GET`."""
+        arrays = {name: getattr(self.env, name) for name in self.NAMES}
+        return {"arrays": arrays, "rng": self.env.np_random.bit_generator.state}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """See `SET`."""
+        for name in self.NAMES:
+            setattr(self.env, name, state["arrays"][name])
+        self.env.np_random.bit_generator.state = state["rng"]
+
+
+# ------------------------------------------------------------------------------- from episode to episode
+
+# Either the environment gives its state, or ``names`` lists attributes: "0.counter" of the outermost layer,
+# "1.obs_rms" of the one inside it. `differing` finds them in a used copy beside a fresh one. Files hold
+# values only; the objects that take them are those of the environment.
+
+# layers that begin anew at every reset, and attributes that say nothing about an episode
+RESET = (
+    "OrderEnforcing",
+    "PassiveEnvChecker",
+    "TimeLimit",
+    "FrameStackObservation",
+    "RecordEpisodeStatistics",
+)
+SILENT = ("spec", "metadata", "action_space", "observation_space", "render_mode")
+MOST_TEXT = 1 << 16  # characters of JSON that an attribute may have
+ABSENT = object()
+
+
+def layers(env: Any) -> Iterator[Any]:
+    """The environment, and those inside it."""
+    while True:
+        yield env
+        if not isinstance(env, gym.Wrapper):
+            return
+        env = env.env
+
+
+def clean(env: Any, names: Sequence[str], seed: int) -> Any:
+    """What an environment carries before its first episode. One that gives its state is reset for it, because
+    some make their attributes in reset.
+    """
+    if not names:
+        env.reset(seed=seed)
+    return take(env, names)
+
+
+def take(env: Any, names: Sequence[str]) -> Any:
+    """What an environment carries, as JSON. TypeError for what no file can hold."""
+    if not names:
+        return encode(saved_state(env))
+    found = {name: _attribute(env, name) for name in names}
+    return encode({name: _portable(value) for name, value in found.items() if value is not ABSENT})
+
+
+def give(env: Any, carried: Any, seed: int) -> None:
+    """Let an environment carry what `take` found in another copy, or earlier in this one."""
+    found = decode(carried)
+    if "own" in found:
+        if isinstance(env, gym.Env):
+            env.reset(seed=seed)
+        restore_state(env, found)
+        return
+    if any(_attribute(env, name) is ABSENT for name in found):
+        env.reset(seed=seed)
+    for name, value in found.items():
+        layer = _layer(env, name)
+        old = vars(layer).get(name.partition(".")[2], None)
+        vars(layer)[name.partition(".")[2]] = _built(old, value)
+
+
+def differing(used: Any, fresh: Any) -> list[str]:
+    """Attributes of plain values in which two copies differ."""
+    pairs = enumerate(zip(layers(used), layers(fresh), strict=True))
+    return [
+        f"{depth}.{name}"
+        for depth, (a, b) in pairs
+        if type(a).__name__ not in RESET
+        for name in vars(a)
+        if name not in SILENT and (text := _text(a, name)) and text != _text(b, name)
+    ]
+
+
+def _text(layer: Any, name: str) -> str:
+    """An attribute as text to compare; empty when it holds no plain values, or too many."""
+    try:
+        text = str(encode(_portable(vars(layer)[name])))
+    except (TypeError, KeyError, RecursionError):
+        return ""
+    return text if len(text) <= MOST_TEXT else ""
+
+
+def _layer(env: Any, name: str) -> Any:
+    return list(layers(env))[int(name.partition(".")[0])]
+
+
+def _attribute(env: Any, name: str) -> Any:
+    return vars(_layer(env, name)).get(name.partition(".")[2], ABSENT)
+
+
+def _portable(value: Any) -> Any:
+    """A value in terms of `encode`. TypeError for an opaque object."""
+    if isinstance(value, np.random.Generator):
+        return value.bit_generator.state
+    if isinstance(value, np.random.RandomState):
+        return value.get_state(legacy=False)
+    if isinstance(value, random.Random):
+        version, numbers, gauss = value.getstate()
+        return [version, list(numbers), gauss]
+    if type(value).__name__ == "RunningMeanStd":  # Gymnasium's, and copies of it
+        return {name: _portable(item) for name, item in vars(value).items()}
+    if isinstance(value, list | tuple | deque):
+        return [_portable(item) for item in value]
+    if isinstance(value, dict):
+        return {name: _portable(item) for name, item in value.items()}
+    encode(value)
+    return value
+
+
+def _built(old: Any, value: Any) -> Any:
+    """A value of `_portable` in the kind of the one that it replaces; generators stay the same objects."""
+    if isinstance(old, np.random.Generator):
+        old.bit_generator.state = value
+    elif isinstance(old, np.random.RandomState):
+        old.set_state(value)
+    elif isinstance(old, random.Random):
+        old.setstate((value[0], tuple(value[1]), value[2]))
+    elif type(old).__name__ == "RunningMeanStd":
+        vars(old).update({name: _built(vars(old).get(name), item) for name, item in value.items()})
+    elif isinstance(old, deque):
+        return deque(value, old.maxlen)
+    else:
+        return tuple(value) if isinstance(old, tuple) else value
+    return old

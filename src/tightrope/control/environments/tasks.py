@@ -110,6 +110,21 @@ def make_by_id(env_id: str, **keywords: Any) -> gym.Env:
     return _explained(env_id, lambda: gym.make(env_id, disable_env_checker=True, **keywords))
 
 
+def renew_world(env: gym.Env) -> None:
+    """Before a seeded reset of BipedalWalker: give it the physics world of a new environment.
+
+    It keeps one world for life, in which the order of contacts depends on every body that has been there, and
+    the solver takes them in turn: the same seed and actions then end in other last bits.
+    """
+    walker: Any = env.unwrapped
+    if type(walker).__module__ == "gymnasium.envs.box2d.bipedal_walker" and walker.world is not None:
+        import Box2D
+
+        walker._destroy()
+        old = walker.world
+        walker.world = Box2D.b2World(gravity=old.gravity, doSleep=old.allowSleeping)
+
+
 def make_vector_by_id(env_id: str, num_envs: int, keywords: Mapping[str, Any] | None = None) -> Any:
     """The task's own vector version, resetting in the same step where it can; ValueError without one."""
     spec = find_spec(env_id)
@@ -139,6 +154,17 @@ def make_vector_by_id(env_id: str, num_envs: int, keywords: Mapping[str, Any] | 
         return _trusting(make_vec())
 
     return _explained(env_id, make)
+
+
+def resets_rows_with_seeds(vector: Any) -> bool:
+    """Whether single rows of a vector environment can be reset with seeds, and repeat their episodes: Atari's
+    do, from ale-py 0.12 on; earlier ones raise or hang.
+    """
+    if type(vector).__module__ != "ale_py.vector_env":
+        return False
+    import ale_py
+
+    return tuple(int(part) for part in ale_py.__version__.split(".")[:2]) >= (0, 12)
 
 
 class _AnyAction(gym.spaces.MultiDiscrete):

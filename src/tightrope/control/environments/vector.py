@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 import gymnasium as gym
@@ -21,6 +21,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from tightrope.control.environments import state as states
+from tightrope.control.environments import tasks
 from tightrope.control.environments.base import Environments, Step
 from tightrope.control.environments.faults import (
     RAISED,
@@ -31,10 +32,10 @@ from tightrope.control.environments.faults import (
     check_finite,
     explained,
     kind_of,
-    restart_seed,
     wait_before_restart,
 )
 from tightrope.control.environments.masks import find_source, vector_masks
+from tightrope.control.environments.seeds import Start
 from tightrope.control.environments.success import SUCCESS_KEY, vector_success
 from tightrope.control.environments.tasks import close_environment
 from tightrope.control.environments.watchdog import Watchdog, limited
@@ -109,7 +110,10 @@ class VectorEnvironments(Environments):
         self.action_layout = action_layout(self._env.single_action_space, reading.action_bounds)
         self.gives_state = states.gives_state(self._env)
         self.row_groups = (slice(0, self.num_envs),)  # they are stepped together
-        self._seed = 0
+        self._episode = 0  # of which the seed was that of the last reset
+        self._resets_rows = tasks.resets_rows_with_seeds(self._env)
+        self._origins = np.zeros((self.num_envs, 3), np.int64)  # as in StepBuffers; of seeded rows
+        self._waiting = np.full(self.num_envs, -1)  # the count of steps at which a row begins; -1: it has
         self._count = 0  # steps since the last reset by the caller
         self._restarts_here = 0  # since then
         self._calls = 0  # of the environment, that have begun
@@ -127,19 +131,22 @@ class VectorEnvironments(Environments):
         """A number that changes with every call; None between calls."""
         return self._calls if self._in_call else None
 
-    def reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
-        """See Environments."""
+    def _reset(self, starts: Sequence[Start] | None) -> tuple[Inputs, np.ndarray | None]:
         if self._watchdog is not None:
             self._watchdog.start()
-        self._seed = seed
+        starts = [Start()] * self.num_envs if starts is None else starts
+        self._episode = starts[0].episode
+        waits = np.array([start.wait for start in starts])
+        self._origins[:] = np.column_stack([[start.episode for start in starts], 0 * waits, waits])
+        self._waiting[:] = np.where(waits > 0, waits, -1)
         self._count = 0
         self._restarts_here = 0
         try:
-            return self._reset(seed)
+            return self._reset_env(self.seed_of(0))
         except RAISED as error:
             return self._restart(error)
 
-    def _reset(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
+    def _reset_env(self, seed: int) -> tuple[Inputs, np.ndarray | None]:
         self._calls += 1
         self._in_call = True
         try:
@@ -152,7 +159,9 @@ class VectorEnvironments(Environments):
             with warnings.catch_warnings():
                 # it was built with the seed
                 warnings.filterwarnings("ignore", message="EnvPool seeds are fixed")
-                result = env.reset(seed=seed)
+                result = env.reset(
+                    seed=self._row_seeds(np.ones(self.num_envs, bool)) if self.replays else seed
+                )
             if not (isinstance(result, tuple) and len(result) == 2):
                 raise ApiBreak(f"reset returned {kind_of(result)}, expected the pair (observations, infos)")
             observations, infos = result
@@ -185,7 +194,8 @@ class VectorEnvironments(Environments):
             inputs, masks = self._restart(error)
             rewards = np.zeros(self.num_envs)
             no_end = np.zeros(self.num_envs, bool)
-            return Step(inputs, masks, rewards, no_end, no_end.copy(), cut=~no_end)
+            origins = self._origins.copy() if self.replays else None
+            return Step(inputs, masks, rewards, no_end, no_end.copy(), cut=~no_end, origins=origins)
         finally:
             self._in_call = False
 
@@ -221,9 +231,52 @@ class VectorEnvironments(Environments):
             rows = np.flatnonzero(truncated) if _any(truncated) else None
             finals = None if rows is None else self._final_inputs(infos, rows)
             masks = self._masks(observations, infos, None)
-            return Step(inputs, masks, rewards, terminated, truncated, None, rows, finals, success=success)
+            step = Step(inputs, masks, rewards, terminated, truncated, None, rows, finals, success=success)
+            return self._seed_rows(step) if self.replays else step
         masks = self._masks(observations, infos, terminated | truncated)
         return self._reset_ended(Step(inputs, masks, rewards, terminated, truncated, success=success))
+
+    # ------------------------------------------------------------------------------------------ seeds of rows
+
+    @property
+    def replays(self) -> bool:  # type: ignore[override]
+        """See Environments."""
+        return self._resets_rows and self.reseed_after is not None and self.mode == AutoresetMode.SAME_STEP
+
+    def origins(self) -> np.ndarray | None:
+        """See Environments."""
+        if not self.replays:
+            return None
+        return np.column_stack([self._origins[:, :2], self._count - self._origins[:, 2]])
+
+    def renew(self, row: int, wait: int) -> tuple[Inputs, np.ndarray | None]:
+        """See Environments."""
+        self._origins[row] = (self._origins[row, :2].sum() + 1, 0, self._count + wait)
+        self._waiting[row] = self._count + wait if wait else -1
+        return self._reset_rows(np.arange(self.num_envs) == row), None
+
+    def _seed_rows(self, step: Step) -> Step:
+        """Reset with seeds the rows whose next episode is to have one, and those that waited until now."""
+        waits = self._waiting >= 0
+        step = step._replace(terminated=step.terminated & ~waits, truncated=step.truncated & ~waits)
+        ended, begins = step.terminated | step.truncated, self._waiting == self._count
+        due = np.zeros_like(ended)
+        for row in np.flatnonzero(ended):
+            due[row] = self.seeding.due(self._count - int(self._origins[row, 2]))
+            self._origins[row, 1] += 1
+        self._origins[due, 0] = self._origins[due, :2].sum(axis=1)
+        self._origins[due, 1:] = (0, self._count)
+        self._waiting[begins] = -1
+        if ended.any():
+            step = step._replace(origins=self._origins.copy())
+        return step._replace(inputs=self._reset_rows(due | begins)) if (due | begins).any() else step
+
+    def _reset_rows(self, rows: np.ndarray) -> Inputs:
+        observations, _ = self._env.reset(seed=self._row_seeds(rows), options={"reset_mask": rows})
+        return self._encode(observations)
+
+    def _row_seeds(self, rows: np.ndarray) -> np.ndarray:
+        return np.array([self.seed_of(row) for row in np.flatnonzero(rows).tolist()])
 
     def _check(
         self, rewards: Any, terminated: Any, truncated: Any
@@ -315,6 +368,10 @@ class VectorEnvironments(Environments):
 
         def attempt() -> tuple[Inputs, np.ndarray | None]:
             self._restarts_here += 1
+            self._episode += 1
+            self._origins[:] = np.column_stack(
+                [self._origins[:, :2].sum(axis=1) + 1, np.full((self.num_envs, 2), [0, self._count])]
+            )
             wait_before_restart(self._restarts_here, self.policy)
             with contextlib.suppress(EnvironmentFault):
                 self._close_env()
@@ -322,7 +379,7 @@ class VectorEnvironments(Environments):
             fresh = make(seed)
             self._make = lambda seed: fresh
             self._use(fresh)
-            return self._reset(seed)
+            return self._reset_env(seed)
 
         return self._restarts.until_it_works(fault, attempt, self._fault)
 
@@ -350,21 +407,22 @@ class VectorEnvironments(Environments):
         return layout.to_env(self._actions) if index < 0 else layout.to_env_single(self._actions[index])
 
     def seed_of(self, row: int) -> int:
-        """The one seed of all rows."""
-        return restart_seed(self._seed, self._restarts_here, 0) if self._restarts_here else self._seed
+        """The seed of a row; the one of all rows where they are seeded as a whole."""
+        if self.replays:
+            return self.seeding.seed(row, int(self._origins[row, 0]))
+        return self.seeding.seed(0, self._episode)
 
     # ------------------------------------------------------------------------------------------------- state
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> Any:
         """See Environments."""
-        found = [states.saved_state(self._env), self._ended.tolist()]
-        return {"seed": self._seed, "renewals": self._restarts_here, "states": found}
+        return {"env": states.saved_state(self._env), "ended": self._ended.tolist(), "episode": self._episode}
 
-    def _set_state(self, state: dict[str, Any]) -> None:
-        self._restarts_here = int(state["renewals"])
-        env_state, ended = state["states"]
-        states.restore_state(self._env, env_state)
-        self._ended = np.array(ended, bool).reshape(self._ended.shape)
+    def set_state(self, state: Any) -> None:
+        """See Environments."""
+        states.restore_state(self._env, state["env"])
+        self._ended = np.array(state["ended"], bool).reshape(self._ended.shape)
+        self._episode = int(state["episode"])
         self._any_ended = _any(self._ended)
 
     def close(self) -> None:

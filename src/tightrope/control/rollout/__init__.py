@@ -1,3 +1,3 @@
 """Collecting rollouts."""
 
-__all__ = ["collector", "episodes", "rollout"]
+__all__ = ["collector", "episodes", "rollout", "running"]

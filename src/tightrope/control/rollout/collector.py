@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from time import perf_counter
 from typing import Any
 
@@ -10,36 +11,39 @@ from torch import nn
 
 from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
 from tightrope.control.engine.base import Acted, Engine
+from tightrope.control.environments import replay
 from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import (
     FLOAT32_MAX,
+    EnvironmentFault,
+    FailedEpisode,
     action_text,
     circumstances,
     first_unusable,
 )
+from tightrope.control.environments.seeds import Start
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.rollout.rollout import Rollout
+from tightrope.control.rollout.running import Boundary
 from tightrope.control.spaces.structure import Array, Inputs, float_parts
 from tightrope.errors import TightropeError
+from tightrope.runs.records import plain
 
 
 class BadNumbers(TightropeError, ValueError):
     """An environment returned a NaN or an infinity; nothing was learned from it."""
 
 
-def reset_seed(seed: int, step: int) -> int:
-    """The seed of a reset at an agent step; at step 0 that of the run. Single environment i adds i."""
-    if step == 0:
-        return seed
-    return int(np.random.SeedSequence([seed, step]).generate_state(1)[0]) >> 2  # with i it fits 31 bits
-
-
 class Collector:
     """Fills rollouts; carries observations and running episodes from one to the next."""
 
     def __init__(
-        self, environments: Environments, normalisers: Normalisers, rng: np.random.Generator
+        self,
+        environments: Environments,
+        normalisers: Normalisers,
+        rng: np.random.Generator,
+        replay_limit: int = 20_000,
     ) -> None:
         self.environments = environments
         self.normalisers = normalisers
@@ -49,39 +53,64 @@ class Collector:
         self._step_count = 0
         self._column = 0  # the step of the rollout that is under way
         self._restarts = 0  # those that earlier rollouts reported
+        self.failed: FailedEpisode | None = None  # the episode in which an environment ended the rollout
+        self.replay_limit = replay_limit
 
-    def reset(self, seed: int, step: int = 0) -> None:
-        """Start new episodes at an agent step, with seeds that depend only on (seed, step).
-
-        Those that were running are cut: their last step was bootstrapped, and they are not counted.
-        """
-        self._inputs, self._action_mask = self.environments.reset(reset_seed(seed, step))
+    def reset(self, seed: int, episode: int = 0) -> None:
+        """Begin new episodes in all copies: number ``episode`` of each."""
+        starts = [Start(episode)] * self.environments.num_envs
+        self._begin_from(*self.environments.reset(seed, starts=starts))
         self._returns = np.zeros(self.environments.num_envs)
         self._lengths = np.zeros(self.environments.num_envs, np.int64)
         if self.normalisers.rewards is not None:
             self.normalisers.rewards.restart(self.environments.num_envs)
 
-    def state(self) -> dict[str, Any] | None:
-        """The running episodes as JSON; None when the environments cannot give their state."""
-        if not self.environments.gives_state:
-            return None
-        names = ("_inputs", "_action_mask", "_returns", "_lengths")
-        episodes = {name: states.encode(getattr(self, name)) for name in names}
-        return {**episodes, "environments": self.environments.get_state()}
+    def _begin_from(self, inputs: Inputs, action_mask: Array | None) -> None:
+        self._inputs, self._action_mask = inputs, action_mask
+        self._running = replay.begun(self.environments, inputs, action_mask)
+        self._state = self.environments.get_state() if self.environments.gives_state else None
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue the episodes of a `state`. ValueError for one of other environments."""
-        restarts = self.environments.restarts
-        self.environments.count_from(0)  # the reset repeats the restarts of the first time
-        inputs, action_mask = self.environments.set_state(state["environments"])
-        self.environments.count_from(restarts)
-        zeros = np.zeros(self.environments.num_envs)
-        like = {"_inputs": inputs, "_action_mask": action_mask, "_returns": zeros}
-        for name, fresh in {**like, "_lengths": zeros.astype(np.int64)}.items():
-            found = states.decode(state[name])
-            if not states.alike(found, fresh):  # the compiled engine would read beyond it
-                raise ValueError(f"{name.strip('_')} of the episodes have another shape than here")
-            setattr(self, name, found)
+    def boundary(self) -> Boundary:
+        """The running episodes, after a reset, a rollout or a `resume`."""
+        seen = (self._inputs, self._action_mask, self._returns, self._lengths)
+        return Boundary(*seen, self._running, self._state)
+
+    def resume(self, seed: int, saved: dict[str, Any], logs: dict[str, Array]) -> list[str]:
+        """Continue the episodes of a boundary, as `saved` and its logs describe it; what differs from it,
+        for people. ValueError for one of other environments.
+        """
+        environments = self.environments
+        restarts, copies = environments.restarts, environments.num_envs
+        returns, lengths = states.decode(saved["returns"]), states.decode(saved["lengths"])
+        zeros = np.zeros(copies)
+        for name, array, like in (("returns", returns, zeros), ("lengths", lengths, zeros.astype(np.int64))):
+            _require_alike(name, array, like)
+        differences: list[str] = []
+        if environments.gives_state:
+            first, mask = environments.reset(seed)
+            inputs, action_mask = states.decode(saved["inputs"]), states.decode(saved["action_mask"])
+            _require_alike("inputs", inputs, first)
+            _require_alike("action_mask", action_mask, mask)
+            environments.set_state(states.decode(saved["environments"]))
+            self._begin_from(inputs, action_mask)
+        else:
+            origins = np.array(saved["origins"], np.int64).reshape(copies, 3)
+            first_seen = np.array(saved["first"], np.uint32)
+            _require_alike("first", first_seen, np.zeros(copies, np.uint32))
+            was = replay.Running(origins, first_seen, [], saved["carried"])
+            repeated = replay.replay(environments, seed, was, logs)
+            returns[repeated.renewed], lengths[repeated.renewed] = 0.0, 0
+            if self.normalisers.rewards is not None:
+                self.normalisers.rewards.running[repeated.renewed] = 0.0
+            self._inputs, self._action_mask, differences = (
+                repeated.inputs,
+                repeated.mask,
+                repeated.differences,
+            )
+            self._running, self._state = repeated.running, None
+        self._returns, self._lengths = returns, lengths
+        environments.count_from(restarts)
+        return differences
 
     def count_from(self, restarts: int) -> None:
         """Start the restart counter here; earlier rows already reported these."""
@@ -116,9 +145,11 @@ class Collector:
         before = self._collect(engine, warm_up)
         assert self.normalisers.observations is not None
         self.normalisers.observations.update(before.raw[before.mask])
+        steps, episodes, seeds, failed = before.steps, before.episodes, before.seeds, before.failed
         rollout = self._collect(engine, num_steps)
-        rollout.warm_up = before.steps
-        rollout.episodes = before.episodes + rollout.episodes
+        rollout.warm_up = steps
+        rollout.episodes = episodes + rollout.episodes
+        rollout.seeds, rollout.failed = seeds + rollout.seeds, failed + rollout.failed
         rollout.env_seconds += before.env_seconds
         if rollout.restarts is not None:
             rollout.restarts += before.restarts or 0
@@ -128,9 +159,11 @@ class Collector:
         rollout = self._cleared(num_steps)
         try:
             inputs = self._fill(rollout, engine)
-        except Exception:
+        except Exception as error:
             # a NaN observation or a NaN weight is the likelier cause of what failed after it
             self._check(rollout, engine, self._column + 1, self._inputs)
+            if isinstance(error, EnvironmentFault) and error.index >= 0:
+                self.failed = self._failed(rollout, error.index, self._column, now=True)
             raise
         self._inputs = inputs
         self._check(rollout, engine, num_steps, inputs)
@@ -140,9 +173,62 @@ class Collector:
         if self.environments.policy.restart:
             rollout.restarts = self.environments.restarts - self._restarts
             self._restarts = self.environments.restarts
-        rollout.episodes = self._count_episodes(rollout)
+        ended = self._count_episodes(rollout)
+        cut = np.argwhere(rollout.ended & ~rollout.mask) if rollout.restarts else ()
+        found = [self._failed(rollout, int(row), int(t)) for row, t in cut]
+        rollout.failed = [episode for episode in found if episode is not None]
+        rollout.episodes = [episode for _, episode, _ in ended]
+        rollout.seeds = [seed for _, _, seed in ended]
+        self._log(rollout)
         self._step_count += num_steps
         return rollout
+
+    def _failed(self, rollout: Rollout, row: int, column: int, *, now: bool = False) -> FailedEpisode | None:
+        """The episode that ran in a row at a column; ``now``: where the rollout goes no further."""
+        if self._running is None:
+            return None
+        origin, earlier, begin = self._running.origins[row], self._running.parts[row], 0
+        present = self.environments.origins() if now else None
+        found = [(t, x) for t, x in rollout.origins if t < column]
+        for t, origins in [*found, *([] if present is None else [(column, present)])]:
+            if origins[row, 0] != origin[0]:
+                earlier, begin = [], t + 1
+            origin = origins[row]
+        if earlier is None:
+            return None
+        width = rollout.actions.shape[2]
+        parts = [part[:, :width].view(np.float32) for part in earlier]
+        actions = np.concatenate([*parts, rollout.actions[row, begin : column + 1]])
+        layout, carried = self.environments.action_layout, self._running.carried
+        seed = self.environments.seeding.seed(row, int(origin[0]))
+        kept = None if carried is None or begin else carried[row]
+        return FailedEpisode(
+            row,
+            seed,
+            int(origin[1]),
+            kept,
+            [plain(layout.to_env_single(action)) for action in actions],
+        )
+
+    def _log(self, rollout: Rollout) -> None:
+        """Keep what the running episodes need to continue from here."""
+        if self.environments.gives_state:
+            self._state = self.environments.get_state()
+        if self._running is None:
+            return
+        observations = {k: x for k, x in rollout.inputs.items() if k.startswith("image")}
+        if rollout.raw.size:
+            observations["flat"] = rollout.raw
+        stepped = replay.Stepped(
+            observations, self._inputs, rollout.inputs.get("action_mask"), self._action_mask,
+            rollout.rewards, rollout.terminated, rollout.truncated, rollout.actions,
+        )  # fmt: skip
+        begun = self._running.origins[0, 0]
+        over = next((t + 1 for t, origins in rollout.origins if origins[0, 0] != begun), 0)
+        if over and not rollout.mask[0, over - 1]:
+            over = 0  # a fault cut it
+        limit = self.replay_limit
+        self._running = replay.continued(self._running, self.environments, stepped, limit, over)
 
     def _cleared(self, num_steps: int) -> Rollout:
         rollout = self._rollout
@@ -185,6 +271,8 @@ class Collector:
                 rollout.ended[step.cut, t] = True
             if step.final_rows is not None and step.final_inputs is not None:
                 rollout.finals.append((t, step.final_rows, step.final_inputs))
+            if step.origins is not None:
+                rollout.origins.append((t, step.origins))
         self._action_mask = action_mask
         rollout.env_seconds = env_seconds
         return inputs
@@ -221,6 +309,7 @@ class Collector:
             if column + t >= 0:
                 chosen = rollout.actions[row, column + t]
                 action = action_text(environments.action_layout.to_env_single(chosen))
+            self.failed = self._failed(rollout, row, max(0, column + t))
             raise BadNumbers(
                 f"Environment {row} of {environments.spec_id} returned {what} = {numbers[place, t, index]} "
                 f"at {where}{circumstances(environments.worker_of(row), environments.seed_of(row), action)}; "
@@ -243,24 +332,38 @@ class Collector:
             + "It was not updated with this rollout. Look for a learning rate that is too high."
         )
 
-    def _count_episodes(self, rollout: Rollout) -> list[tuple[float, int, bool]]:
-        """(return, length, terminated) of every episode that ended in the rollout, by column.
+    def _count_episodes(
+        self, rollout: Rollout
+    ) -> list[tuple[int, tuple[float, int, bool], tuple[int | None, int]]]:
+        """Every episode that ended in the rollout, by column: (column, (return, length, terminated), seed).
 
-        One that a fault cut is not an episode.
+        One that a fault cut is not an episode. The seed: see Update.
         """
         running = np.cumsum(np.where(rollout.mask, rollout.rewards, 0.0), axis=1) + self._returns[:, None]
         lengths = np.cumsum(rollout.mask, axis=1) + self._lengths[:, None]
         found = []
         self._returns = running[:, -1].copy()
         self._lengths = lengths[:, -1].copy()
+        origins = [] if self._running is None else [self._running.origins, *(x for _, x in rollout.origins)]
+        columns = [t for t, _ in rollout.origins]  # the last step before each of these origins but the first
         for row in np.flatnonzero(rollout.ended.any(axis=1)):
             ends = np.flatnonzero(rollout.ended[row])
             totals, counts = running[row, ends], lengths[row, ends]
             for k, t in enumerate(ends):
                 before = (totals[k - 1], counts[k - 1]) if k else (0.0, 0)
-                flag = bool(rollout.terminated[row, t])
-                if rollout.mask[row, t]:
-                    found.append((int(t), float(totals[k] - before[0]), int(counts[k] - before[1]), flag))
+                if not rollout.mask[row, t]:
+                    continue
+                seed: tuple[int | None, int] = (None, 0)
+                if origins:
+                    number, after = origins[bisect_left(columns, t)][row, :2].tolist()
+                    seed = (self.environments.seeding.seed(int(row), number), after)
+                total, length = float(totals[k] - before[0]), int(counts[k] - before[1])
+                found.append((int(t), (total, length, bool(rollout.terminated[row, t])), seed))
             self._returns[row] -= totals[-1]
             self._lengths[row] -= counts[-1]
-        return [episode[1:] for episode in sorted(found, key=lambda episode: episode[0])]
+        return sorted(found, key=lambda ended: ended[0])
+
+
+def _require_alike(name: str, found: Any, like: Any) -> None:
+    if not states.alike(found, like):  # the compiled engine would read beyond it
+        raise ValueError(f"{name} of the episodes have another shape than here")

@@ -9,6 +9,7 @@ from tightrope.algorithms.batch import Batch, move_scale
 from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
 from tightrope.control.engine.base import Engine, Steps
 from tightrope.control.environments.base import Environments
+from tightrope.control.environments.faults import FailedEpisode
 from tightrope.control.policy.normalise import EDGE, Normalisers
 from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.maths.values import ReturnScale
@@ -46,10 +47,13 @@ class Rollout:
         self.ended = np.zeros(shape, bool)
         self.last: Inputs = {}
         self.finals: list[tuple[int, Array, Inputs]] = []
+        self.origins: list[tuple[int, Array]] = []  # (column in which episodes ended, origins after it)
         self.episodes: list[tuple[float, int, bool]] = []
         self.successes: list[float] = []  # of the episodes that said whether they reached their goal
+        self.seeds: list[tuple[int | None, int]] = []  # of these episodes, see Update
         self.reward_statistics_taken = False
         self.warm_up = 0  # steps before it that are not learned from
+        self.failed: list[FailedEpisode] = []  # of copies that were restarted
         self.env_seconds = 0.0
         self.restarts: int | None = None  # of environments; None: the settings do not allow it
 
@@ -64,6 +68,7 @@ class Rollout:
         self.ended.fill(False)
         self.finals = []
         self.successes = []
+        self.origins = []
         self.reward_statistics_taken = False
         self.warm_up = 0
 

@@ -1,0 +1,166 @@
+"""Whether a task repeats its episodes is found at the start, written into settings.json, and told if it does
+not; what a task keeps from one episode to the next is carried to the copy that repeats a later one.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from tightrope.control import train
+from tightrope.control.agent import Agent
+from tightrope.control.environments import state as states
+from tightrope.control.resolve import resolve
+from tightrope.runs.run import Run
+
+wrap = gym.wrappers
+
+
+class Outside(gym.Wrapper):
+    """Draws from numpy's global generator."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = self.env.step(action)
+        return observation, reward + np.random.normal(), *rest  # noqa: NPY002
+
+
+class Counts(gym.Wrapper):
+    """Its rewards depend on how many episodes there were, which no reset changes."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.episodes, self.own = 0, np.random.default_rng(5)
+
+    def reset(self, **keywords: Any) -> Any:
+        self.episodes += 1
+        return self.env.reset(**keywords)
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = self.env.step(action)
+        return observation, reward + self.episodes + self.own.normal(), *rest
+
+
+class Hidden(Counts):
+    """The same behind an object that cannot be looked into."""
+
+    class Box:
+        __slots__ = ("n",)
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.box = Hidden.Box()
+        self.box.n = 0
+
+    def reset(self, **keywords: Any) -> Any:
+        self.box.n += 1
+        return self.env.reset(**keywords)
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = self.env.step(action)
+        return observation, reward + self.box.n, *rest
+
+
+TASKS = {
+    "plain": (lambda: gym.make("CartPole-v1"), "", "yes"),
+    "normalised": (
+        lambda: wrap.NormalizeReward(wrap.NormalizeObservation(gym.make("CartPole-v1"))),
+        "0.return_rms 0.discounted_reward 1.obs_rms",
+        "yes",
+    ),
+    "stacked": (
+        lambda: wrap.FlattenObservation(wrap.FrameStackObservation(gym.make("CartPole-v1"), 3)),
+        "",
+        "yes",
+    ),
+    "counts": (lambda: Counts(gym.make("CartPole-v1")), "0.episodes 0.own", "yes"),
+    "outside": (lambda: Outside(gym.make("CartPole-v1")), "", "no"),
+    "hidden": (lambda: Hidden(gym.make("CartPole-v1")), "", "no"),
+}
+VALUES = {
+    "total_steps": 1600, "num_envs": 4, "num_steps": 50, "minibatch_size": 100, "num_epochs": 1, "seed": 3,
+    "evaluate_every": 0.5, "evaluation_episodes": 2, "checkpoint_every": 0.25, "threads": 1,
+    "engine": "torch",
+}  # fmt: skip
+
+
+class Killed(BaseException):
+    """Ends a run at once."""
+
+
+@pytest.mark.parametrize(
+    ("name", "backend"),
+    [*((name, "serial") for name in TASKS), ("normalised", "workers"), ("hidden", "workers")],
+)
+def test_the_answer_is_written_down_and_a_resume_is_exact(tmp_path, monkeypatch, name, backend):
+    make, carried, repeats = TASKS[name]
+    workers = {"vector_backend": backend, "num_workers": 2 if backend == "workers" else None}
+    settings = resolve(make, "ppo", {**VALUES, **workers})
+    said: list[str] = []
+    train.train(settings, run_dir=tmp_path / "whole", env=make, listeners=[lambda e: said.append(str(e))])
+    written = json.loads((tmp_path / "whole" / "settings.json").read_text())
+    assert (written["carried"], written["repeats"]) == (carried, repeats)
+    told = [line for line in said if "do not repeat from seed" in line]
+    assert len(told) == (repeats == "no") and all("self.np_random" in line for line in told)
+    if repeats == "no":
+        return
+
+    real, count = Agent._one_update, 0
+
+    def dying(*arguments: Any, **keywords: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count == 6:
+            raise Killed
+        return real(*arguments, **keywords)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Agent, "_one_update", dying)
+        with pytest.raises(Killed):
+            train.train(settings, run_dir=tmp_path / "hops", env=make)
+    said.clear()
+    train.resume(tmp_path / "hops", env=make, listeners=[lambda e: said.append(str(e))])
+    assert not [line for line in said if "did not repeat" in line]
+    first, second = (Run.open(tmp_path / run).newest() for run in ("whole", "hops"))
+    for group, tensors in first.tensors.items():
+        assert all(torch.equal(x, second.tensors[group][key]) for key, x in tensors.items()), group
+
+
+def test_bipedal_walkers_repeat_in_used_copies(tmp_path):
+    pytest.importorskip("Box2D")
+    values = {**VALUES, "total_steps": 4800, "num_envs": 2, "checkpoint_every": None, "evaluate_every": None}
+    train.train(resolve("BipedalWalker-v3", "ppo", values), run_dir=tmp_path / "run")
+    assert json.loads((tmp_path / "run" / "settings.json").read_text())["repeats"] == "yes"
+
+
+def test_tests_leave_the_generators_of_the_run_alone(tmp_path):
+    """A run that is tested has the weights of an agent that is not."""
+    import tightrope
+
+    values = {**VALUES, "vector_backend": "serial", "evaluate_every": None}
+    np.random.seed(1)  # noqa: NPY002
+    agent = tightrope.PPO("CartPole-v1", **values).learn(1600)
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    train.train(resolve("CartPole-v1", "ppo", values), run_dir=tmp_path / "run")
+    assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
+    weights = Run.open(tmp_path / "run").newest().tensors["policy"]
+    assert all(torch.equal(x, weights[name]) for name, x in agent.policy.state_dict().items())
+    agent.close()
+
+
+def test_what_is_carried_goes_into_other_objects_of_the_same_kind():
+    a, b = (Counts(wrap.NormalizeObservation(gym.make("CartPole-v1"))) for _ in range(2))
+    for seed in range(3):
+        a.reset(seed=seed)
+        a.step(0)
+    a.reset(seed=0)
+    b.reset(seed=0)
+    names = states.differing(a, b)
+    assert names == ["0.episodes", "0.own", "1.obs_rms"]
+    own, moments = b.own, b.env.obs_rms
+    states.give(b, json.loads(json.dumps(states.take(a, names))), 0)
+    assert not states.differing(a, b) and b.own is own and b.env.obs_rms is moments
