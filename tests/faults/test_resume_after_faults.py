@@ -58,7 +58,7 @@ def test_the_count_of_restarts_and_their_seeds_continue(tmp_path, monkeypatch, e
     after = Run.open(hops).newest().state["environment_restarts"]
     assert 0 < before < after
     rows = [json.loads(line) for line in (hops / "metrics.jsonl").read_text().splitlines()]
-    assert sum(row["rollout/environment_restarts"] for row in rows) == after
+    assert sum(row.get("rollout/environment_restarts", 0.0) for row in rows) == after
 
 
 def poison_control(patch: Any) -> None:

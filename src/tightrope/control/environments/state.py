@@ -173,7 +173,7 @@ MOST_TEXT = 1 << 16  # characters of JSON that an attribute may have
 ABSENT = object()
 
 
-def layers(env: Any) -> Iterator[Any]:
+def nested(env: Any) -> Iterator[Any]:
     """The environment, and those inside it."""
     while True:
         yield env
@@ -217,7 +217,7 @@ def give(env: Any, carried: Any, seed: int) -> None:
 
 def differing(used: Any, fresh: Any) -> list[str]:
     """Attributes of plain values in which two copies differ."""
-    pairs = enumerate(zip(layers(used), layers(fresh), strict=True))
+    pairs = enumerate(zip(nested(used), nested(fresh), strict=True))
     return [
         f"{depth}.{name}"
         for depth, (a, b) in pairs
@@ -237,7 +237,7 @@ def _text(layer: Any, name: str) -> str:
 
 
 def _layer(env: Any, name: str) -> Any:
-    return list(layers(env))[int(name.partition(".")[0])]
+    return list(nested(env))[int(name.partition(".")[0])]
 
 
 def _attribute(env: Any, name: str) -> Any:
