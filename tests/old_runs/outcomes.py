@@ -199,7 +199,7 @@ def resumed(name: str) -> Outcome:
         try:
             train.resume(name, env=ENVIRONMENTS[name])
         except ValueError as refusal:
-            return outcome({"refused": str(refusal)})
+            return outcome({"refused": str(refusal).replace(f"{Path.cwd()}/", "")})
     elif code := main(["resume", name, "--quiet"]):
         raise AssertionError(f"tightrope resume {name} ends with {code}")
     return end_of(name)
