@@ -19,8 +19,8 @@ from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import RAISED, FaultPolicy
 from tightrope.control.environments.pool import EnvironmentPool
 from tightrope.control.environments.processes import in_process_of_its_own
-from tightrope.control.environments.replay import Repeatable, Running, replay
 from tightrope.control.environments.state import differing
+from tightrope.control.rollout.replay import Repeatable, Running, replay
 from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 

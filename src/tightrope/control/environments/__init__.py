@@ -1,6 +1,6 @@
 """Copies of a task behind reset and step."""
 
 __all__ = [
-    "base", "copies", "faults", "make", "masks", "pool", "processes", "replay", "seeds", "state", "tasks",
+    "base", "copies", "faults", "make", "masks", "pool", "processes", "seeds", "state", "tasks",
     "vector", "watchdog",
 ]  # fmt: skip

@@ -1,3 +1,3 @@
 """Collecting rollouts."""
 
-__all__ = ["collector", "episodes", "rollout", "running"]
+__all__ = ["collector", "episodes", "replay", "rollout", "running"]

@@ -11,7 +11,6 @@ from torch import nn
 
 from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
 from tightrope.control.engine.base import Acted, Engine
-from tightrope.control.environments import replay
 from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import (
@@ -24,6 +23,7 @@ from tightrope.control.environments.faults import (
 )
 from tightrope.control.environments.seeds import Start
 from tightrope.control.policy.normalise import Normalisers
+from tightrope.control.rollout import replay
 from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.rollout.running import Boundary
 from tightrope.control.spaces.structure import Array, Inputs, float_parts

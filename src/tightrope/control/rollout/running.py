@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from tightrope.control.environments import replay
 from tightrope.control.environments import state as states
+from tightrope.control.rollout import replay
 from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.runs.growing import GROUP as ACTIONS
 
