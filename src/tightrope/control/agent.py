@@ -175,14 +175,14 @@ class Agent:
         generators and statistics go back to where they were, and the running episodes are repeated before the
         next one.
         """
-        generators = (self.sampling_rng, self.update_rng)
+        streams = (self.sampling_rng, self.update_rng)
         with signals.stoppable(only_ctrl_c=True), signals.uninterrupted():
-            before = [rng.bit_generator.state for rng in generators]
+            before = [rng.bit_generator.state for rng in streams]
             statistics = self.normalisers.state()
             try:
                 yield
             except BaseException:
-                for rng, state in zip(generators, before, strict=True):
+                for rng, state in zip(streams, before, strict=True):
                     rng.bit_generator.state = state
                 self.normalisers.load(statistics)
                 self.collector.drop()
