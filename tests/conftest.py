@@ -1,5 +1,7 @@
 """A test may be skipped only for a reason listed here; any other skip fails the run."""
 
+import signal
+
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -13,6 +15,10 @@ ALLOWED = (
     "needs a cache",  # TIGHTROPE_NUMBA_CACHE=off
 )
 _unexpected: list[str] = []
+
+# a shell starts background commands with SIGINT ignored, and processes that tests start would inherit that
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:

@@ -143,7 +143,12 @@ def test_the_wheel_trains_evaluates_and_aligns_from_an_empty_environment(environ
 
 
 # imported by this package, declared by another package that brings it
-BROUGHT_BY = {"llvmlite": "numba", "huggingface-hub": "transformers", "mujoco": "gymnasium"}
+BROUGHT_BY = {
+    "llvmlite": "numba",
+    "huggingface-hub": "transformers",
+    "mujoco": "gymnasium",
+    "box2d": "gymnasium",
+}
 OF_THE_USER = {"datasets"}  # a hub data set: the error names the package to install
 
 

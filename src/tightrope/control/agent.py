@@ -75,7 +75,7 @@ class Agent:
         self.env = env
         require_room(self.settings)
         present = self.settings
-        with generators.apart(present.seed):  # what constructors draw
+        with signals.stoppable(only_ctrl_c=True), generators.apart(present.seed):  # what constructors draw
             self.environments = _environments(env, present)
         torch_device = usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
@@ -264,9 +264,11 @@ class Agent:
 
     def _log_ratio_limit(self, batch: Batch) -> float:
         """1e-5, times what rounding in float32 grows with: columns, the size of inputs, a small deviation;
-        and a hundred after the first update, when the weights may have grown.
+        and a hundred after the first update, when the weights may have grown, or a thousand where the
+        deviation comes from weights too.
         """
-        scale = float(max(1, self.environments.action_layout.num_columns)) * (100.0 if self.steps else 1.0)
+        grown = 100.0 if self.settings.std == "independent" else 1000.0
+        scale = float(max(1, self.environments.action_layout.num_columns)) * (grown if self.steps else 1.0)
         if "flat" in batch.inputs:
             scale *= max(1.0, float(batch.inputs["flat"].abs().max()))
         if self.policy.log_std is not None:

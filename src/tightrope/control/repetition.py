@@ -38,8 +38,10 @@ def carried_attributes(environments: Environments) -> list[str]:
     """Attributes that no reset with a seed sets anew, see state.py. ValueError: why nobody knows."""
     maker = environments.makers[-1]
 
-    def search() -> list[str]:
+    def search(stack: contextlib.ExitStack) -> list[str]:
         used, fresh = maker(), maker()
+        for env in (used, fresh):
+            stack.callback(env.close)
         if used is fresh:
             return []
         with contextlib.suppress(*RAISED):  # an action that its mask forbids, say: it is used all the same
@@ -49,7 +51,7 @@ def carried_attributes(environments: Environments) -> list[str]:
         fresh.reset(seed=9)
         return differing(used, fresh)
 
-    return in_process_of_its_own(search)
+    return in_process_of_its_own(search, environments.policy.timeout)
 
 
 def _play(env: gym.Env, seed: int) -> None:
@@ -68,14 +70,15 @@ def difference_of(environments: Environments, ended: Repeatable) -> str:
     seeding, reading, name = environments.seeding, environments.reading, environments.spec_id
     maker = environments.makers[-1]
 
-    def repeat() -> list[str]:
+    def repeat(stack: contextlib.ExitStack) -> list[str]:
         twin = EnvironmentPool([maker], 1, name, policy=FaultPolicy(timeout=None), reading=reading)
+        stack.callback(twin.close)
         twin.reseed_after, twin.carried_names = seeding.reseed_after, seeding.carried
         origins = np.array([[ended.episode, 0, len(ended.log)]])
         saved = Running(origins, np.array([ended.first], np.uint32), [], [ended.carried])
         return replay(twin, seeding.run, saved, {f"0.{ended.episode}": ended.log}).differences
 
-    return "; ".join(in_process_of_its_own(repeat))
+    return "; ".join(in_process_of_its_own(repeat, None))
 
 
 class Repetition:

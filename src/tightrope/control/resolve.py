@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tightrope.control.presets import BY_TASK, preset
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
+from tightrope.runs import signals
 
 if TYPE_CHECKING:
     from tightrope.control.environments.base import Environments
@@ -86,7 +87,8 @@ def _describe(env: Any, values: dict[str, Any]) -> tuple[str, int | None]:
     given = TrainSettings(**values)
     made: list[Any] = []
     limit = functools.partial(limited, timeout=given.env_timeout)
-    with contextlib.chdir("."), contextlib.ExitStack() as stack:  # a constructor may move away
+    # a constructor may move away, and a KeyboardInterrupt of its own is no Ctrl-C
+    with contextlib.chdir("."), signals.stoppable(only_ctrl_c=True), contextlib.ExitStack() as stack:
         if isinstance(env, str) and env.startswith("ALE/") and given.vector_backend in ("auto", "vector"):
             made.append(make_vector_by_id(env, 1, given.env_kwargs))
         elif not is_vector_env(env):

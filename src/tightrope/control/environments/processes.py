@@ -38,6 +38,7 @@ READY, MASKED, BROKEN, ENDED = b"k", b"m", b"e", b"x"
 TO_START = 60.0  # seconds at least for a worker that is not forked: it imports everything again
 SETTLED = b"t"  # follows the reply to SETTLE, and no other
 LONGEST_ANSWER = 600.0  # seconds for an answer of `in_process_of_its_own`
+LONGEST_END = 1.0  # and for its end after that
 SPIN = 2e-4  # seconds to poll for a message before sleeping; waking up costs about as much as a step
 
 _yield_core: Callable[[], Any] = getattr(os, "sched_yield", int)  # int() where there is nothing to call
@@ -338,23 +339,30 @@ def close_inherited() -> None:
         inherited.close()
 
 
-def in_process_of_its_own(function: Callable[[], Any]) -> Any:
-    """What a function returns in a process of its own. ValueError: it raised, died or hung there."""
+def in_process_of_its_own(function: Callable[[contextlib.ExitStack], Any], limit: float | None) -> Any:
+    """What a function returns in a process of its own, which then has a second to close what is on the stack.
+
+    ``limit``: seconds for the answer. ValueError: it raised, died or hung there.
+    """
     ours, theirs = socket.socketpair()
-    ours.settimeout(LONGEST_ANSWER)
+    ours.settimeout(LONGEST_ANSWER if limit is None else limit)
     process = start_context().Process(  # type: ignore[attr-defined]
-        target=_answer, args=(CloudpickleWrapper(function), theirs), daemon=True, name="tightrope-twin"
+        target=_answer,
+        args=(CloudpickleWrapper(function), theirs),  # type: ignore[arg-type]
+        daemon=True,
+        name="tightrope-twin",
     )
     process.start()
     theirs.close()
     try:
         (length,) = LENGTH.unpack(receive_all(ours, LENGTH.size))
         found, error = json.loads(receive_all(ours, length))
+        process.join(LONGEST_END)
     except (OSError, EOFError) as gone:
-        process.kill()
         raise ValueError(f"the process with a second copy was lost ({gone})") from gone
     finally:
         ours.close()
+        process.kill()
         process.join()
     if error:
         raise ValueError(error)
@@ -365,9 +373,10 @@ def _answer(function: Any, channel: socket.socket) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     close_inherited()
-    try:
-        answer = (function.fn(), "")
-    except RAISED as error:
-        answer = (None, f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(*RAISED), contextlib.ExitStack() as stack:
+        try:
+            answer = (function.fn(stack), "")
+        except RAISED as error:
+            answer = (None, f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
         channel.sendall(pack_json(answer))
+    os._exit(0)  # whatever threads an environment has left
