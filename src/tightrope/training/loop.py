@@ -136,6 +136,7 @@ class _Loop:
             metrics["train/rollbacks"] = float(learner.rollbacks)
         metrics["time/seconds"] = learner.seconds
         found = learner.evaluate(update)
+        self._keep_handlers()
         self._evaluated(step, found)
         with signals.uninterrupted():
             run.record_episodes(
