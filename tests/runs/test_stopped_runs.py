@@ -300,9 +300,7 @@ def test_a_keyboard_interrupt_of_an_environment_is_its_fault(tmp_path, backend):
 @pytest.mark.parametrize("backend", ["serial", "workers"])
 def test_nor_does_one_in_close_hide_the_fault_before_it(tmp_path, backend):
     workers = {"vector_backend": backend, "num_workers": 2 if backend == "workers" else None}
-    settings = settings_for(
-        Walk, engine="torch", on_env_fault="restart", max_env_restarts=1, **workers
-    )
+    settings = settings_for(Walk, engine="torch", on_env_fault="restart", max_env_restarts=1, **workers)
     with pytest.raises(EnvironmentFault):
         train.train(settings, run_dir=tmp_path / "run", env=InterruptsLater)
 
