@@ -175,20 +175,20 @@ class Agent:
         generators and statistics go back to where they were, and the running episodes are repeated before the
         next one.
         """
-        streams = (self.sampling_rng, self.update_rng)
         with signals.stoppable(only_ctrl_c=True), signals.uninterrupted():
-            before = [rng.bit_generator.state for rng in streams]
+            self._before = before = self._present()
             statistics = self.normalisers.state()
             try:
                 yield
             except BaseException:
-                for rng, state in zip(streams, before, strict=True):
-                    rng.bit_generator.state = state
+                self.sampling_rng.bit_generator.state = before.rng["sampling"]
+                self.update_rng.bit_generator.state = before.rng["update"]
                 self.normalisers.load(statistics)
                 self.collector.drop()
-                if self._before is not None:
-                    self._fresh, self._saved, self._before = True, self._before.episodes(), None
+                self._fresh, self._saved = True, before.episodes()
                 raise
+            finally:
+                self._before = None
 
     def _learned(self) -> Tensors:
         """What an update changes in place."""
@@ -221,7 +221,6 @@ class Agent:
 
     def _one_update(self, warm_up: int, columns: int, progress: float) -> tuple[dict[str, float], Rollout]:
         """collect -> advantages -> update -> statistics."""
-        self._before = self._present()
         present = self.settings.update.unchecked(**self.changes).at(progress)
         if isinstance(present, PPOSettings) and self.kl_beta is not None:
             present = present.unchecked(kl_beta=self.kl_beta)
@@ -251,7 +250,6 @@ class Agent:
             self.kl_beta = ppo.next_kl_beta(present.kl_beta, kl, present.kl_adapt)
         self.normalisers.update(rollout)
         self.steps += rollout.steps
-        self._before = None
         finish = time.perf_counter()
         metrics |= _settings_metrics(present) | self.episodes.add(rollout)
         if rollout.restarts is not None:

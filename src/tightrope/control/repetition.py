@@ -35,7 +35,7 @@ REMEDY = (
 
 
 def carried_attributes(environments: Environments) -> list[str]:
-    """Attributes that no reset with a seed sets anew, see state.py. ValueError: why nobody knows."""
+    """Attributes that a reset with a seed leaves as they are, see state.py. ValueError: why nobody knows."""
     maker = environments.makers[-1]
 
     def search(stack: contextlib.ExitStack) -> list[str]:

@@ -53,7 +53,7 @@ def resolve_with_preset(
     sizes = (merged["num_envs"], merged["num_steps"])
     if algorithm == "ppo" and "minibatch_size" not in values and all(type(size) is int for size in sizes):
         chosen["minibatch_size"] = max(1, min(chosen.get("minibatch_size", 64), sizes[0] * sizes[1]))
-    if env_id.startswith("ALE/"):  # a seeded reset loads the game anew, 80 ms
+    if env_id.startswith("ALE/"):  # a seeded reset loads the game again, 80 ms
         chosen["reseed_after"] = 8192
     settings = TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
     return settings, chosen

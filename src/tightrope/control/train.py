@@ -205,7 +205,6 @@ class AgentLearner:
             )
         except ValueError as error:
             self.listeners.info(f"no evaluation while training: {error}")
-            return
 
     def iterate(self) -> Iterator[Update]:
         """The agent's updates."""

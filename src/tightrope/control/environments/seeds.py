@@ -35,7 +35,7 @@ class Seeding(NamedTuple):
     run: int
     stream: int = TRAINING
     reseed_after: int | None = None
-    carried: Sequence[str] = ()  # attributes that environments keep from episode to episode, see carried.py
+    carried: Sequence[str] = ()  # attributes that environments keep from episode to episode, see state.py
 
     def seed(self, copy: int, episode: int) -> int:
         """The seed of an episode."""

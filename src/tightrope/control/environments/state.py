@@ -160,7 +160,7 @@ class _CartPoles:
 # "1.obs_rms" of the one inside it. `differing` finds them in a used copy beside a fresh one. Files hold
 # values only; the objects that take them are those of the environment.
 
-# layers that begin anew at every reset, and attributes that say nothing about an episode
+# layers that start over at every reset, and attributes that say nothing about an episode
 RESET = (
     "OrderEnforcing",
     "PassiveEnvChecker",
