@@ -22,6 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from tightrope.control.environments.state import nested
 from tightrope.control.environments.tasks import make_by_id, require_keywords, without_noise
 
 # wrappers that gym.make adds or not, without effect on a task
@@ -253,10 +254,7 @@ def _short(value: Any) -> str:
 
 def layers(env: gym.Env) -> list[gym.Env]:
     """The environment from its outermost wrapper to the task, bookkeeping left out."""
-    found = [env]
-    while isinstance(found[-1], gym.Wrapper):
-        found.append(found[-1].env)
-    return [layer for layer in found if type(layer).__name__ not in BOOKKEEPING]
+    return [layer for layer in nested(env) if type(layer).__name__ not in BOOKKEEPING]
 
 
 def _name(layer: gym.Env) -> str:
