@@ -38,18 +38,17 @@ MAY_IMPORT = {
     | {"training"}
     | {f"control.{part}" for part in ("spaces", "environments", "policy", "engine", "rollout")},
     "language.data": CORE,
-    "language.model": CORE | {"language.data", "language.quiet"},
+    "language.model": CORE | {"language.data"},
     "language.generation": CORE | {"language.data", "language.model"},
     "language.memory": CORE | {"language.model", "language.generation", "language.settings"},
     "language.policy": CORE
     | {"language.settings", *(f"language.{part}" for part in ("data", "model", "generation", "memory"))},
-    "language.reward": CORE
-    | {"language.quiet", *(f"language.{part}" for part in ("data", "model", "generation", "policy"))},
+    "language.reward": CORE | {*(f"language.{part}" for part in ("data", "model", "generation", "policy"))},
     "language.supervised": CORE
-    | {"training", "language.settings", "language.quiet"}
+    | {"training", "language.settings"}
     | {f"language.{part}" for part in ("data", "model", "generation", "memory", "reward")},
     "language.alignment": CORE
-    | {"training", "language.settings", "language.quiet"}
+    | {"training", "language.settings"}
     | {
         f"language.{part}"
         for part in ("data", "model", "generation", "memory", "policy", "reward", "supervised")

@@ -8,7 +8,7 @@ import warnings
 import pytest
 from language.tiny import saved, tiny_llama
 
-from tightrope.language.quiet import quiet_libraries
+from tightrope.language.model.load import quiet_libraries
 
 PROGRAM = """
 from tightrope.language import align, sample_run
@@ -92,7 +92,7 @@ def test_the_bars_of_the_hub_are_as_they_were(off):
 
 
 def test_the_hubs_own_switch_brings_no_warning():
-    program = "from tightrope.language.quiet import quiet_libraries\nwith quiet_libraries():\n    pass\n"
+    program = "from tightrope.language.model.load import quiet_libraries\nwith quiet_libraries():\n    pass\n"
     environment = {**os.environ, "HF_HUB_DISABLE_PROGRESS_BARS": "0"}
     command = [sys.executable, "-c", program]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)

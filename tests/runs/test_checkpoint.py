@@ -16,9 +16,8 @@ from safetensors.torch import load_file
 
 from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.runs import checkpoint, retention, versions
-from tightrope.runs.checkpoint import CheckpointError
+from tightrope.runs.checkpoint import CheckpointError, safetensors_bytes
 from tightrope.runs.durable import TEMPORARY, CannotWrite, remove_leftovers, writing
-from tightrope.runs.tensors import safetensors_bytes
 
 
 def tensors() -> dict[str, dict[str, torch.Tensor]]:

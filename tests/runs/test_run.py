@@ -19,9 +19,8 @@ from tightrope.runs import checkpoint
 from tightrope.runs.checkpoint import CheckpointError
 from tightrope.runs.durable import TEMPORARY
 from tightrope.runs.lock import WriterLock
-from tightrope.runs.records import dumps, plain, read_json, read_lines, write_json
+from tightrope.runs.records import dumps, plain, read_json, read_lines, signed, write_json
 from tightrope.runs.run import Run
-from tightrope.runs.signed import signed
 from tightrope.training.events import Started, Updated
 from tightrope.training.tensorboard import TensorBoard
 

@@ -426,8 +426,7 @@ def _unknown_setting(name: str, known: list[str], algorithm: str) -> str:
 
 def _settings_in(path: str) -> Any:
     """What a settings.json holds, given as a file or as the folder of a run. UsageError if there is none."""
-    from tightrope.runs.records import read_json
-    from tightrope.runs.signed import unsigned
+    from tightrope.runs.records import read_json, unsigned
 
     if not path:
         raise UsageError("--settings is empty. Give RUN/settings.json.")

@@ -179,7 +179,8 @@ class Agent:
             self._before = before = self._present()
             statistics = self.normalisers.state()
             try:
-                yield
+                with whole_update(self._update_seconds, self._learned, self._unlearn):
+                    yield
             except BaseException:
                 self.sampling_rng.bit_generator.state = before.rng["sampling"]
                 self.update_rng.bit_generator.state = before.rng["update"]
@@ -231,20 +232,19 @@ class Agent:
                 self.notify(line)
             rollout = self.collector.collect(self.engine, columns, warm_up)
         collected = time.perf_counter()
-        with whole_update(self._update_seconds, self._learned, self._unlearn):
-            batch = to_batch(rollout, self.engine, self.normalisers, present, True)
-            metrics = self.normalisers.metrics() | cut_shares(rollout, self.environments, self.normalisers)
-            if bool(batch.mask.any()):
-                metrics |= self.engine.update(
-                    batch,
-                    present,
-                    self.update_rng,
-                    refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
-                    log_ratio_limit=self._log_ratio_limit(batch),
-                )
-                metrics["train/explained_variance"] = float(
-                    explained_variance(batch.old_values, batch.returns, batch.mask)
-                )
+        batch, metrics = to_batch(rollout, self.engine, self.normalisers, present, True), dict[str, float]()
+        if bool(batch.mask.any()):
+            metrics = self.engine.update(
+                batch,
+                present,
+                self.update_rng,
+                refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
+                log_ratio_limit=self._log_ratio_limit(batch),
+            )
+            metrics["train/explained_variance"] = float(
+                explained_variance(batch.old_values, batch.returns, batch.mask)
+            )
+        metrics |= self.normalisers.metrics() | cut_shares(rollout, self.environments, self.normalisers)
         kl = metrics.get("train/kl_after")
         if isinstance(present, PPOSettings) and present.kl_beta and present.kl_adapt and kl is not None:
             self.kl_beta = ppo.next_kl_beta(present.kl_beta, kl, present.kl_adapt)

@@ -27,8 +27,8 @@ from tightrope.runs.run import Run
 from tightrope.training import loop
 from tightrope.training.events import Listener, Listeners
 from tightrope.training.learner import Update, crosses
+from tightrope.training.loop import continue_from, newest_point
 from tightrope.training.parameters import Tensors
-from tightrope.training.resume import continue_from, newest_point
 from tightrope.training.tensorboard import require_tensorboard
 
 __all__ = ["resolve", "resume", "train"]

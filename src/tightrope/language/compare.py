@@ -16,9 +16,8 @@ from tightrope.language.data.batching import pad_left
 from tightrope.language.data.examples import Prompt, read_prompts
 from tightrope.language.generation.distribution import Sampling
 from tightrope.language.generation.sample import sample
-from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer
+from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, quiet_libraries
 from tightrope.language.model.packaged import find_model
-from tightrope.language.quiet import quiet_libraries
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.folders import require_kind
 from tightrope.runs.run import Run

@@ -17,10 +17,9 @@ from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import log_ratio_limit
-from tightrope.language.policy.policy_model import PolicyModel
+from tightrope.language.model.load import quiet_libraries
+from tightrope.language.policy.policy_model import Experience, PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
-from tightrope.language.policy.rollout import Experience
-from tightrope.language.quiet import quiet_libraries
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings, RLHFSettings
 

@@ -19,7 +19,7 @@ al. 2016, https://arxiv.org/abs/1506.02438
 import torch
 from torch import Tensor
 
-from .shapes import require_same_shape
+from .statistics import require_same_shape
 
 
 def td_errors(

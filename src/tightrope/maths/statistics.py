@@ -1,4 +1,4 @@
-"""Statistics over the steps that count. Masked steps are cut by `torch.where`: they may hold NaN.
+"""Statistics over the steps that count, and the guard against tensors of different shapes. Masked steps are cut by `torch.where`: they may hold NaN.
 
 The masked functions are the only reductions in this package, to scalars in the unit of their input.
 """
@@ -8,7 +8,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .shapes import require_same_shape
+
+def require_same_shape(**tensors: Tensor | None) -> None:
+    """Raise ValueError, naming the arguments, unless all given tensors have one shape; None is skipped.
+
+    A guard against silent broadcasting: [B] against [B, T] would compute something, and something wrong.
+    """
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor is not None}
+    if len(set(shapes.values())) > 1:
+        seen = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise ValueError(f"shapes differ: {seen}. Expected one shape for all; reshape them before the call.")
 
 
 def masked_sum(x: Tensor, mask: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .divergence import k3
-from .shapes import require_same_shape
+from .statistics import require_same_shape
 
 
 def log_ratio(logp: Tensor, old_logp: Tensor, mask: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .shapes import require_same_shape
+from .statistics import require_same_shape
 
 
 def squared_error(values: Tensor, returns: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import json
 import re
 import stat
 from collections.abc import Callable, Iterator
@@ -21,8 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tightrope.errors import TightropeError
 from tightrope.runs import versions
 from tightrope.runs.durable import atomic_folder, present, write_file
-from tightrope.runs.records import canonical, dumps, read_json
-from tightrope.runs.tensors import safetensors_bytes
+from tightrope.runs.records import dumps, json_sha256, read_json
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -93,11 +93,6 @@ def _manifest_text(manifest: dict[str, Any]) -> bytes:
     """The only valid text of a manifest, which includes the hash of its content."""
     bare = {name: value for name, value in manifest.items() if name != "sha256"}
     return (dumps({**bare, "sha256": json_sha256(bare)}, indent=2) + "\n").encode("utf-8")
-
-
-def json_sha256(value: Any) -> str:
-    """The SHA-256 of the canonical JSON of a value."""
-    return hashlib.sha256(canonical(value)).hexdigest()
 
 
 def _refuse_to_replace(folder: Path) -> None:
@@ -297,3 +292,41 @@ def _verified(path: Path, entry: Any, *, read: bool = True) -> bytes:
     if digest != entry.get("sha256"):
         raise CheckpointError(f"{path} does not match the SHA-256 in manifest.json. {_ADVICE}")
     return content
+
+
+_NAMES = {
+    "bool": "BOOL",
+    "uint8": "U8",
+    "int8": "I8",
+    "uint16": "U16",
+    "int16": "I16",
+    "float16": "F16",
+    "bfloat16": "BF16",
+    "uint32": "U32",
+    "int32": "I32",
+    "float32": "F32",
+    "uint64": "U64",
+    "int64": "I64",
+    "float64": "F64",
+}
+
+
+def safetensors_bytes(tensors: dict[str, Tensor]) -> Iterator[bytes | memoryview]:
+    """The bytes of a safetensors file of these tensors. ValueError for a dtype without a name there."""
+    import torch
+
+    ordered = sorted(tensors, key=lambda name: (-tensors[name].itemsize, name))  # so that each is aligned
+    header, end = {}, 0
+    for name in ordered:
+        tensor, begin = tensors[name], end
+        kind = str(tensor.dtype).removeprefix("torch.")
+        if kind not in _NAMES:
+            raise ValueError(f"{name} is a tensor of {kind}; a checkpoint holds {', '.join(_NAMES)}.")
+        end = begin + tensor.numel() * tensor.itemsize
+        header[name] = {"dtype": _NAMES[kind], "shape": list(tensor.shape), "data_offsets": [begin, end]}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    yield len(text).to_bytes(8, "little") + text
+    for name in ordered:
+        plain = tensors[name].detach().cpu().contiguous().reshape(-1)
+        yield plain.view(torch.uint8).numpy().data

@@ -17,6 +17,7 @@ from typing import Any
 
 from tightrope.runs.durable import BLOCK, replace_file, spare_standard_streams, write_all, writing
 
+SIGNATURE = "sha256"  # in settings.json: of the settings in it, so that a resume notices any change
 # The files of a run that grow. changes.jsonl: settings that a listener has changed; actions.jsonl: growing.
 RECORDS = ("metrics.jsonl", "episodes.jsonl", "samples.jsonl", "changes.jsonl", "actions.jsonl")
 
@@ -61,6 +62,11 @@ def canonical(value: Any) -> bytes:
     return json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
+def json_sha256(value: Any) -> str:
+    """The SHA-256 of the canonical JSON of a value."""
+    return hashlib.sha256(canonical(value)).hexdigest()
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write one JSON file so that a reader sees the old one or the new one whole, also after a crash. Raises
     CannotWrite.
@@ -83,6 +89,37 @@ def read_json(path: Path) -> Any:
         )
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not readable as JSON ({error}).") from error
+
+
+def signed(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings and their hash."""
+    return {**settings, SIGNATURE: json_sha256(settings)}
+
+
+def unsigned(found: dict[str, Any]) -> dict[str, Any]:
+    """The settings without their hash."""
+    return {name: value for name, value in found.items() if name != SIGNATURE}
+
+
+def require_own(file: Path, found: dict[str, Any]) -> None:
+    """ValueError if the content of ``file`` does not match its hash; a file without a hash is accepted."""
+    if SIGNATURE in found and found[SIGNATURE] != json_sha256(unsigned(found)):
+        raise ValueError(
+            f"{file} is not as the run wrote it: its sha256 belongs to other settings, so the "
+            f"result would be that of another run. Restore it, or start a new run: --settings {file}"
+        )
+
+
+def read_settings(path: Path, *, own: bool) -> dict[str, Any]:
+    """The settings in a file, without their hash. ValueError if they are not an object, and with ``own`` if
+    they are not as the run wrote them.
+    """
+    settings = read_json(path)
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path} holds {type(settings).__name__}, expected an object.")
+    if own:
+        require_own(path, settings)
+    return unsigned(settings)
 
 
 def each_key_once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:

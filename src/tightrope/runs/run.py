@@ -24,11 +24,12 @@ from tightrope.runs.records import (
     dumps,
     plain,
     read_lines,
+    read_settings,
     refuse_links,
+    signed,
     write_json,
 )
 from tightrope.runs.retention import Checkpoint, marks_of
-from tightrope.runs.signed import read_settings, signed
 
 if TYPE_CHECKING:
     from torch import Tensor

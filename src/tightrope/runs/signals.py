@@ -30,17 +30,18 @@ class Stopped(KeyboardInterrupt):
 
 
 class _Work(NamedTuple):
-    """What is not interrupted: in words (empty: it is soon over), its end by `time.monotonic` (None: not
-    known), and whether it can be undone.
+    """What is not interrupted: in words (empty: it is soon over), how many seconds it takes (None: not
+    known), whether it can be undone, and when it began by `time.monotonic`.
     """
 
     what: str
-    end: float | None
+    seconds: float | None
     can_undo: bool
+    begin: float
 
     def left(self) -> float | None:
         """Seconds until the end."""
-        return None if self.end is None else max(0.0, self.end - time.monotonic())
+        return None if self.seconds is None else max(0.0, self.begin + self.seconds - time.monotonic())
 
 
 class _Answer:
@@ -130,7 +131,7 @@ def uninterrupted(what: str = "", seconds: float | None = None, *, can_undo: boo
     than PATIENCE, or nobody knows how long.
     """
     raise_if_stopped()
-    _answer.work.append(_Work(what, None if seconds is None else time.monotonic() + seconds, can_undo))
+    _answer.work.append(_Work(what, seconds, can_undo, time.monotonic()))
     try:
         if _answer.active and _answer.came and not (_answer.answered or _answer.waits()):
             raise Stopped(_answer.came[-1])  # it came in what is around
@@ -142,13 +143,15 @@ def uninterrupted(what: str = "", seconds: float | None = None, *, can_undo: boo
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Inside `uninterrupted`, around what can be left at any moment: a signal takes effect at once."""
+    """Inside `uninterrupted`, around what can be left at any moment: a signal takes effect at once. The work
+    around it begins, or begins again, at the end.
+    """
     outer, _answer.work = _answer.work, []
     try:
         raise_if_stopped()
         yield
     finally:
-        _answer.work = outer
+        _answer.work = [work._replace(begin=time.monotonic()) for work in outer]
 
 
 def raise_if_stopped() -> None:

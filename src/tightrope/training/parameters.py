@@ -39,10 +39,10 @@ def restore_tensors(
 def whole_update(
     seconds: float | None, tensors: Callable[[], Tensors], put_back: Callable[[Tensors], None] | None
 ) -> Iterator[None]:
-    """Around the steps of an update, which changes ``tensors()`` in place. After a signal it is finished if
-    it takes less than PATIENCE, by the ``seconds`` that the one before took (None: not known). Otherwise it
-    is undone by ``put_back`` and a copy; with ``put_back`` None no copy is kept, and it is finished all the
-    same.
+    """Around an iteration, whose update changes ``tensors()`` in place; what it learns from is collected
+    inside `signals.interruptible`, before the update. After a signal the update is finished if it takes less
+    than PATIENCE, by the ``seconds`` that the one before took (None: not known). Otherwise it is undone by
+    ``put_back`` and a copy; with ``put_back`` None no copy is kept, and it is finished all the same.
     """
     copy: Tensors | None = None
     if put_back is not None and (seconds is None or seconds > COPY_FROM):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.language.alignment.iteration import Trainer
-from tightrope.language.quiet import quiet_libraries
+from tightrope.language.model.load import quiet_libraries
 from tightrope.language.settings import AlignSettings, recorded
 from tightrope.language.supervised.prepare import threads
 from tightrope.runs import signals
@@ -22,7 +22,7 @@ from tightrope.runs.records import retyped
 from tightrope.runs.run import Run
 from tightrope.training import loop
 from tightrope.training.events import Listener, Listeners
-from tightrope.training.resume import continue_from, newest_point
+from tightrope.training.loop import continue_from, newest_point
 from tightrope.training.tensorboard import require_tensorboard
 
 __all__ = ["Aligned", "align", "resume_align"]

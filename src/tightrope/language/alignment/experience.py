@@ -20,8 +20,8 @@ from tightrope.language.alignment.kl import kl_rewards
 from tightrope.language.data.batching import length_groups, pad_left
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions, sample
+from tightrope.language.policy.policy_model import Experience, FirstPass, ResponseInputs
 from tightrope.language.policy.roles import Roles
-from tightrope.language.policy.rollout import Experience, FirstPass, ResponseInputs
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings
 from tightrope.maths import returns

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from tightrope.algorithms.descent import SamplingMismatch
 from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
+from tightrope.language.policy.policy_model import Experience
 from tightrope.language.policy.roles import Roles
-from tightrope.language.policy.rollout import Experience
 from tightrope.language.reward.functions import Scores
 from tightrope.maths import divergence
 from tightrope.maths.statistics import masked_mean, masked_sum

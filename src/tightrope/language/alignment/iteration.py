@@ -35,9 +35,8 @@ from tightrope.language.generation.sample import log_ratio_limit
 from tightrope.language.model.architecture import context_length
 from tightrope.language.model.packaged import find_model
 from tightrope.language.model.saving import save_model
-from tightrope.language.policy.policy_model import PolicyModel
+from tightrope.language.policy.policy_model import Experience, FirstPass, PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
-from tightrope.language.policy.rollout import Experience, FirstPass
 from tightrope.language.reward.call import RewardError
 from tightrope.language.reward.functions import Scores
 from tightrope.language.reward.judge import (
@@ -318,10 +317,13 @@ class Trainer:
 
     def iterate(self) -> Iterator[Update]:
         """One iteration at a time. One that a signal ends is as if it had not begun."""
+        adapters = self.settings.tune == "lora" and self.settings.critic != "separate"
         while count := self._next_prompts():
             before = self._numbers()
             try:
-                update = self._one_iteration([self.prompts[i] for i in self.order.take(count)])
+                # a copy of every weight of a model would be too large
+                with whole_update(self._update_seconds, self._learned, self._unlearn if adapters else None):
+                    update = self._one_iteration([self.prompts[i] for i in self.order.take(count)])
             except KeyboardInterrupt:
                 self._put_back(before)
                 raise
@@ -338,9 +340,7 @@ class Trainer:
         begin = time.perf_counter()
         if taken.counts and not self.stopped:
             # a KL in the loss is scaled as the rewards were
-            adapters = settings.tune == "lora" and settings.critic != "separate"
-            with whole_update(self._update_seconds, self._learned, self._unlearn if adapters else None):
-                metrics |= self._update(taken.batch, present, experience, self.kl_beta * taken.scale)
+            metrics |= self._update(taken.batch, present, experience, self.kl_beta * taken.scale)
             if settings.critic != "none":
                 metrics["train/explained_variance"] = float(
                     explained_variance(taken.batch.old_values, taken.batch.returns, taken.batch.mask)

@@ -56,7 +56,7 @@ from torch import Tensor
 
 from tightrope.language.settings import KL_FORMS
 from tightrope.maths import divergence, statistics, surrogate
-from tightrope.maths.shapes import require_same_shape
+from tightrope.maths.statistics import require_same_shape
 
 LARGEST_CHANGE = 0.2  # Ziegler 2019: the relative error of the KL is clipped to +- this
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from tightrope.algorithms.batch import Batch
     from tightrope.language.data.examples import Prompt
-    from tightrope.language.policy.rollout import Experience
+    from tightrope.language.policy.policy_model import Experience
     from tightrope.language.reward.functions import Scores
 
 LONGEST = 300  # characters of a prompt or response in a table

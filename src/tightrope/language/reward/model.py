@@ -9,8 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
-from tightrope.language.model.load import fused, load_tokenizer, pretrained, read_object, without_dropout
-from tightrope.language.quiet import quiet_libraries
+from tightrope.language.model.load import (
+    fused,
+    load_tokenizer,
+    pretrained,
+    quiet_libraries,
+    read_object,
+    without_dropout,
+)
 
 SHIFT = "tightrope_reward_shift"  # in config.json: score = output of the head - shift
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tightrope.language.model.architecture import parameter_counts
-from tightrope.language.quiet import quiet_libraries
+from tightrope.language.model.load import quiet_libraries
 from tightrope.language.settings import SupervisedSettings, recorded
 from tightrope.language.supervised.fit import Objective, SupervisedLearner
 from tightrope.language.supervised.prepare import Loaded, prepared
@@ -19,7 +19,7 @@ from tightrope.runs.folders import require_kind
 from tightrope.runs.run import Run
 from tightrope.training import loop
 from tightrope.training.events import Listener, Listeners
-from tightrope.training.resume import continue_from, newest_point
+from tightrope.training.loop import continue_from, newest_point
 from tightrope.training.tensorboard import require_tensorboard
 
 
