@@ -7,7 +7,8 @@
 Each story is traced at its smallest, in this process, on one thread:
 
     control   PPO on a task of this script: torch engine, serial, one environment, two steps, one epoch, one
-              minibatch. From the first ``step`` of the environment to the optimiser's first ``step``
+              minibatch; the second update, because the first one also warms up the statistics. From the
+              first ``step`` of the environment to the optimiser's first ``step``
     language  ``align`` on the packaged glassllm: one prompt, two new tokens, a head as critic, a function as
               reward, one epoch, one minibatch. From the first ``forward`` of the model after the run has
               reported its start (the prompt enters) to the optimiser's first ``step``
@@ -181,7 +182,8 @@ def control() -> Tracer:
             Walk, seed=1, engine="torch", vector_backend="serial", num_envs=1, num_steps=2, num_epochs=1,
             minibatch_size=2, threads=1, notify=lambda text: None,
         )  # fmt: skip
-        updates = agent.iterate(2)
+        updates = agent.iterate(8)
+        next(updates)  # the first one also gives observations their statistics, once a run
         return lambda: next(updates)
 
     def steps(frame: FrameType) -> bool:

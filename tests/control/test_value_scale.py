@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 
 import tightrope
-from tightrope.algorithms.batch import move_scale
+from tightrope.algorithms.batch import moved_scale
 from tightrope.control.rollout.rollout import to_batch
 from tightrope.control.settings import TrainSettings
 
@@ -95,7 +95,9 @@ def test_a_new_critic_counts_for_nothing_and_a_later_one_keeps_its_values():
     batch = to_batch(rollout, agent.engine, agent.normalisers, agent.settings.update)
     before, scale = agent.value(seen), agent.normalisers.returns
     batch = dataclasses.replace(batch, returns=7 * scale.values(batch.returns) + 300)
-    agent.normalisers.returns = move_scale(scale, batch, agent.policy.last_critic_layer)
+    _, agent.normalisers.returns, _ = moved_scale(
+        batch, scale, agent.policy.last_critic_layer, advantages=True
+    )
     assert agent.normalisers.returns.mean > scale.mean + 10
     assert agent.value(seen) == pytest.approx(before, rel=1e-5)
 

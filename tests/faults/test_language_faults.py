@@ -11,7 +11,7 @@ import pytest
 import torch
 from language.tiny import VOCABULARY, saved, tiny_llama
 
-from tightrope.algorithms.micro_batches import OutOfMemory
+from tightrope.algorithms.descent import OutOfMemory
 from tightrope.algorithms.nonfinite import NonFiniteError
 from tightrope.language.alignment.iteration import Trainer
 from tightrope.language.reward.functions import RewardError, Rewards

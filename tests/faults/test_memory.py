@@ -7,7 +7,7 @@ import pytest
 import torch
 from test_bad_numbers import RULES, Line, line_batch
 
-from tightrope.algorithms.micro_batches import OutOfMemory, is_out_of_memory
+from tightrope.algorithms.descent import OutOfMemory, is_out_of_memory
 from tightrope.algorithms.optimise import make_optimiser
 
 ERRORS = [

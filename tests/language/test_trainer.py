@@ -9,7 +9,7 @@ import torch
 from language.tiny import saved, tiny_llama
 
 from tightrope.algorithms import ppo
-from tightrope.algorithms.micro_batches import OutOfMemory
+from tightrope.algorithms.descent import OutOfMemory
 from tightrope.language.alignment.align import align
 from tightrope.language.alignment.experience import batch_of, gather, to_scale
 from tightrope.language.alignment.iteration import Trainer, hold_out_prompts

@@ -64,8 +64,10 @@ class Batch:
         names = ("old_values", "returns", "advantages")
         numbers: dict[str, Any] = {name: getattr(self, name) for name in names}
         if scale is not None:
-            numbers |= {name: scale.outputs(numbers[name]) for name in names[:2]}
-            numbers["advantages"] = self.advantages / (scale.unit if advantages else 1.0)
+            outputs = scale.outputs(torch.stack([self.old_values, self.returns]))
+            numbers |= dict(zip(names, outputs, strict=False))
+            if advantages:
+                numbers["advantages"] = self.advantages / (scale.deviation or 1.0)
         return dataclasses.replace(self, **{name: x.float() for name, x in numbers.items()})
 
     def as_steps(self) -> Batch:
@@ -110,19 +112,21 @@ class Batch:
             yield self.select(slice(start, start + size))
 
 
-def move_scale(scale: ReturnScale, batch: Batch, layer: nn.Linear | None) -> ReturnScale:
-    """The scale after a rollout, whose ``batch`` is in units of the return. ``layer``, the critic's last one,
-    is carried into it; None: outputs have to follow by learning.
+def moved_scale(
+    batch: Batch, scale: ReturnScale, layer: nn.Linear | None, *, advantages: bool
+) -> tuple[Batch, ReturnScale, tuple[float, float]]:
+    """A batch in units of the return, as `Batch.in_scale` gives it after the scale has moved to it; that
+    scale, and the `ReturnScale.change` to it.
 
+    ``layer``, the critic's last one, is carried into the new scale; None: outputs have to follow by learning.
     Adam's moments stay: gradients are of order 1 in either scale.
     """
-    now = scale.update(batch.returns, batch.mask)
+    now, (factor, shift) = scale.moved(batch.returns, batch.mask)
     if layer is not None:
         # .data: a pass that kept its graph still finds this layer, and its gradients are those of the new one
-        factor, shift = scale.change(now)
         layer.weight.data.mul_(factor)
         layer.bias.data.mul_(factor).add_(shift)
-    return now
+    return batch.in_scale(now, advantages=advantages), now, (factor, shift)
 
 
 def scale_metrics(scale: ReturnScale | None) -> dict[str, float]:

@@ -82,12 +82,11 @@ def update(
         return Terms(policy, value, total)
 
     for epoch in range(settings.num_epochs):
-        descent.begin_epoch()
         if epoch and refresh is not None and settings.recompute_advantages:
             batch = refresh(batch).cleared()
         for number, minibatch in enumerate(batch.minibatches(settings.minibatch_size, rng), start=1):
             where = f"in minibatch {number} of epoch {epoch + 1}"
-            if descent.step(batch, minibatch, loss, where, settings.target_kl):
+            if descent.step(batch, minibatch, loss, where, settings.target_kl, new_epoch=number == 1):
                 break
         if descent.halted():
             break

@@ -39,6 +39,17 @@ def td_errors(
     require_same_shape(
         rewards=rewards, values=values, next_values=next_values, terminated=terminated, mask=mask
     )
+    return _td_errors(rewards, values, next_values, terminated, gamma, mask)
+
+
+def _td_errors(
+    rewards: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    terminated: Tensor,
+    gamma: float,
+    mask: Tensor | None,
+) -> Tensor:
     future = torch.where(terminated, 0.0, next_values)
     deltas = rewards + gamma * future - values
     return deltas if mask is None else torch.where(mask, deltas, 0.0)
@@ -62,8 +73,10 @@ def gae(
     `gae_lambda` is one number for all, or a tensor [B], one for each row (a response whose lambda follows its
     length: VAPO, https://arxiv.org/abs/2504.05118). ValueError when the shapes differ.
     """
-    require_same_shape(rewards=rewards, ended=ended)
-    deltas = td_errors(rewards, values, next_values, terminated, gamma, mask)
+    require_same_shape(
+        rewards=rewards, values=values, next_values=next_values, terminated=terminated, ended=ended, mask=mask
+    )
+    deltas = _td_errors(rewards, values, next_values, terminated, gamma, mask)
     if not deltas.shape[1]:
         return deltas
     if isinstance(gae_lambda, Tensor):

@@ -1,5 +1,6 @@
-"""Statistics over the steps that count, and the guard against tensors of different shapes. Masked steps are cut by `torch.where`: they may hold NaN.
+"""Statistics over the steps that count, and the guard against tensors of different shapes.
 
+Masked steps are cut by `torch.where`: they may hold NaN.
 The masked functions are the only reductions in this package, to scalars in the unit of their input.
 """
 

@@ -126,3 +126,8 @@ class ReturnScale:
         if not (self.deviation and new.deviation):
             return 1.0, 0.0
         return self.deviation / new.deviation, (self.mean - new.mean) / new.deviation
+
+    def moved(self, returns: Tensor, mask: Tensor) -> tuple["ReturnScale", tuple[float, float]]:
+        """`update` after a rollout, and the `change` to it."""
+        new = self.update(returns, mask)
+        return new, self.change(new)

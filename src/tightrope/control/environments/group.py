@@ -26,6 +26,7 @@ from tightrope.control.environments.faults import (
     action_text,
     check_finite,
     explained,
+    float_parts,
     kind_of,
     wait_before_restart,
 )
@@ -36,7 +37,7 @@ from tightrope.control.environments.tasks import check_alike, close_environment,
 from tightrope.control.environments.watchdog import limited
 from tightrope.control.spaces.actions import ActionLayout, action_layout
 from tightrope.control.spaces.observations import ObservationLayout, observation_layout
-from tightrope.control.spaces.structure import MASK_KEY, Inputs, Reading, float_parts
+from tightrope.control.spaces.structure import MASK_KEY, Inputs, Reading
 from tightrope.runs import generators
 
 

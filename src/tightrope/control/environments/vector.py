@@ -31,6 +31,7 @@ from tightrope.control.environments.faults import (
     action_text,
     check_finite,
     explained,
+    float_parts,
     kind_of,
     wait_before_restart,
 )
@@ -41,7 +42,7 @@ from tightrope.control.environments.tasks import close_environment
 from tightrope.control.environments.watchdog import Watchdog, limited
 from tightrope.control.spaces.actions import action_layout
 from tightrope.control.spaces.observations import observation_layout
-from tightrope.control.spaces.structure import Inputs, Reading, float_parts
+from tightrope.control.spaces.structure import Inputs, Reading
 
 # the second is a typing error in some of Gymnasium's environments
 MODE_KEYS = ("autoreset_mode", "autoreseet-mode")

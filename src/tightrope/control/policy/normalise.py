@@ -159,21 +159,22 @@ class Normalisers:
         return {**inputs, "flat": seen}
 
     def scaled_rewards(self, rollout: Any) -> Array:
-        """The rewards of a rollout to learn from. The first rollout of all is scaled by its own statistics:
+        """The rewards of a rollout, normalised. The first rollout of all is scaled by its own statistics:
         there are no others.
         """
-        if self.rewards is None:
-            return rollout.rewards
+        assert self.rewards is not None
         if float(self.rewards.moments.count) == 0:
             self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
             rollout.reward_statistics_taken = True
         return self.rewards(rollout.rewards)
 
-    def update(self, rollout: Any) -> None:
-        """Move the statistics of observations and rewards, after the update on this rollout."""
+    def update(self, rollout: Any, *, rewards: bool = True) -> None:
+        """Move the statistics of observations and of ``rewards``: after the update on this rollout, or after
+        the warm-up.
+        """
         if self.observations is not None:
             self.observations.update(rollout.raw[rollout.mask])
-        if self.rewards is not None and not rollout.reward_statistics_taken:
+        if rewards and self.rewards is not None and not rollout.reward_statistics_taken:
             self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
 
     def metrics(self) -> dict[str, float]:

@@ -20,13 +20,14 @@ from tightrope.control.environments.faults import (
     action_text,
     circumstances,
     first_unusable,
+    float_parts,
 )
 from tightrope.control.environments.seeds import Start
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.rollout import replay
 from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.rollout.running import Boundary
-from tightrope.control.spaces.structure import Array, Inputs, float_parts
+from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.errors import TightropeError
 from tightrope.runs.records import plain
 
@@ -140,19 +141,14 @@ class Collector:
         them and their episodes, and does not hold them. The next call reuses the arrays of the rollout that
         it returns.
         """
-        if not warm_up:
-            return self._collect(engine, num_steps)
-        before = self._collect(engine, warm_up)
-        assert self.normalisers.observations is not None
-        self.normalisers.observations.update(before.raw[before.mask])
-        steps, episodes, seeds, failed = before.steps, before.episodes, before.seeds, before.failed
-        rollout = self._collect(engine, num_steps)
-        rollout.warm_up = steps
-        rollout.episodes = episodes + rollout.episodes
-        rollout.seeds, rollout.failed = seeds + rollout.seeds, failed + rollout.failed
-        rollout.env_seconds += before.env_seconds
-        if rollout.restarts is not None:
-            rollout.restarts += before.restarts or 0
+        earlier: dict[str, Any] = {}  # what the warm-up counted
+        for columns in (warm_up, num_steps) if warm_up else (num_steps,):
+            rollout = self._collect(engine, columns)
+            for name, counted in earlier.items():
+                setattr(rollout, name, counted + getattr(rollout, name))
+            if warm_up and not earlier:
+                self.normalisers.update(rollout, rewards=False)
+                earlier = rollout.counts()
         return rollout
 
     def _collect(self, engine: Engine, num_steps: int) -> Rollout:

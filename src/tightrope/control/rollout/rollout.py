@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
-from tightrope.algorithms.batch import Batch, move_scale
+from tightrope.algorithms.batch import Batch, moved_scale
 from tightrope.algorithms.settings import ReinforceSettings, UpdateSettings
 from tightrope.control.engine.base import Engine, Steps
 from tightrope.control.environments.base import Environments
@@ -62,6 +64,12 @@ class Rollout:
         """How many transitions there are, those of the warm-up included."""
         return int(self.mask.sum()) + self.warm_up
 
+    def counts(self) -> dict[str, Any]:
+        """What is told of a rollout beside its arrays; ``warm_up``: its steps, if it is not learned from."""
+        names = ("episodes", "successes", "seeds", "failed", "env_seconds", "restarts")
+        found = {name: getattr(self, name) for name in names} | {"warm_up": self.steps}
+        return {name: x for name, x in found.items() if x is not None}
+
     def clear(self) -> None:
         """Make the arrays ready to be filled again."""
         self.mask.fill(True)
@@ -92,7 +100,7 @@ def to_batch(
     ``move``: first the scale moves to these returns, and the critic's last layer with it, so that values
     stay; a module of the user's has to follow by learning.
     """
-    rewards = normalisers.scaled_rewards(rollout)
+    rewards = rollout.rewards if normalisers.rewards is None else normalisers.scaled_rewards(rollout)
     scale = normalisers.returns or ReturnScale(deviation=1.0)
     values, following = (scale.values(torch.from_numpy(x)).numpy() for x in critic_values(rollout, engine))
     mask = rollout.mask
@@ -115,9 +123,13 @@ def to_batch(
         returns=tensor(advantages + values),
         mask=tensor(mask),
     )
+    kept = settings.normalise_advantages
     if move and normalisers.returns is not None:
-        normalisers.returns = move_scale(normalisers.returns, batch, engine.policy.last_critic_layer)
-    return batch.in_scale(normalisers.returns, advantages=settings.normalise_advantages)
+        batch, normalisers.returns, _ = moved_scale(
+            batch, normalisers.returns, engine.policy.last_critic_layer, advantages=kept
+        )
+        return batch
+    return batch.in_scale(normalisers.returns, advantages=kept)
 
 
 def critic_values(rollout: Rollout, engine: Engine) -> tuple[Array, Array]:

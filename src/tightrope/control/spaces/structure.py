@@ -128,11 +128,6 @@ def bounds_of(space: Space) -> list[Any]:
     return [(part.low.tolist(), part.high.tolist()) for part in boxes]
 
 
-def float_parts(inputs: Inputs) -> list[np.ndarray]:
-    """The inputs that can hold a NaN, each with its rows' numbers in one axis: [N, K]."""
-    return [x.reshape(len(x), -1) for x in inputs.values() if x.dtype.kind == "f"]
-
-
 def useful_bounds(box: spaces.Box) -> np.ndarray:
     """Whether both bounds of each entry, flat, are finite and below BOUND_LIMIT in size: bool [n]."""
     low, high = box.low.ravel().astype(np.float64), box.high.ravel().astype(np.float64)

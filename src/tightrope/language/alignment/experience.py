@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tightrope.algorithms.batch import Batch, move_scale
-from tightrope.algorithms.micro_batches import OutOfMemory, free, is_out_of_memory
+from tightrope.algorithms.batch import Batch, moved_scale
+from tightrope.algorithms.descent import OutOfMemory, free, is_out_of_memory
 from tightrope.language.alignment.kl import kl_rewards
 from tightrope.language.data.batching import length_groups, pad_left
 from tightrope.language.data.examples import Prompt
@@ -273,13 +273,13 @@ def to_scale(
     """
     if before is None:
         return batch.in_scale(None, advantages=False), None
-    now = move_scale(before, batch, head)
+    batch, now, (factor, shift) = moved_scale(batch, before, head, advantages=False)
     if experience.first_pass is not None:
-        outputs, (factor, shift) = experience.first_pass.values, before.change(now)
+        outputs = experience.first_pass.values
         # the graph holds the head that has moved: only the numbers are still those from before
         moved = outputs + (factor * outputs + shift - outputs).detach()
         experience.first_pass = dataclasses.replace(experience.first_pass, values=moved)
-    return batch.in_scale(now, advantages=False), now
+    return batch, now
 
 
 def length_lambda(lengths: Tensor, alpha: float) -> Tensor:

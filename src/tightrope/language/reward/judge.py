@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tightrope.algorithms.micro_batches import OutOfMemory, is_out_of_memory
+from tightrope.algorithms.descent import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions
 from tightrope.language.model import lora

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tightrope.algorithms.descent import CheckedSteps
-from tightrope.algorithms.micro_batches import MicroBatches
+from tightrope.algorithms.descent import CheckedSteps, MicroBatches
 from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam
 from tightrope.language.data.examples import Item
