@@ -54,8 +54,8 @@ MUTANTS = (
     Mutant(
         "the two flags are swapped",
         "returns.py",
-        "td_errors(rewards, values, next_values, terminated, gamma, mask)",
-        "td_errors(rewards, values, next_values, ended, gamma, mask)",
+        "deltas = _td_errors(rewards, values, next_values, terminated, gamma, mask)",
+        "deltas = _td_errors(rewards, values, next_values, ended, gamma, mask)",
     ),
     Mutant("lambda is missing from the trace", "returns.py", "gamma * gae_lambda * torch", "gamma * torch"),
     Mutant(
