@@ -26,7 +26,9 @@ def box(low, high):
 def test_a_squashed_density_integrates_to_one_in_the_environments_own_units(low, high, mean):
     layout, half = box(low, high), torch.tensor([(high - low) / 2])
     u = torch.linspace(-9, 9, 20001)[:, None]
-    distribution = Distribution(layout, torch.full((len(u), 1), mean), torch.tensor([-0.3]), None, half)
+    distribution = Distribution(
+        layout.components, torch.full((len(u), 1), mean), torch.tensor([-0.3]), None, half
+    )
     density = distribution.logp(u).double().exp()
     action = torch.from_numpy(layout.to_env(u.numpy()))[:, 0].double()
     assert float(torch.trapezoid(density, action)) == pytest.approx(1.0, abs=1e-3)
@@ -35,7 +37,7 @@ def test_a_squashed_density_integrates_to_one_in_the_environments_own_units(low,
 
 
 def test_a_gaussian_density_is_the_textbooks():
-    distribution = Distribution(box(-9, 9), torch.tensor([[0.5]]), torch.tensor([math.log(2.0)]))
+    distribution = Distribution(box(-9, 9).components, torch.tensor([[0.5]]), torch.tensor([math.log(2.0)]))
     expected = -0.5 * ((1.5 - 0.5) / 2) ** 2 - math.log(2) - 0.5 * math.log(2 * math.pi)
     assert float(distribution.logp(torch.tensor([[1.5]]))) == pytest.approx(expected, abs=1e-6)
     assert float(distribution.entropy()) == pytest.approx(0.5 * math.log(2 * math.pi * math.e * 4), abs=1e-6)
@@ -93,7 +95,7 @@ def test_state_dependent_deviation_depends_on_the_state():
 def test_masked_categories_are_never_sampled_and_weigh_nothing():
     layout = action_layout(spaces.MultiDiscrete([3, 2]))
     mask = torch.tensor([[True, False, True, False, True]]).expand(5000, 5)
-    distribution = Distribution(layout, torch.zeros(5000, 5), None, mask)
+    distribution = Distribution(layout.components, torch.zeros(5000, 5), None, mask)
     noise = torch.rand(5000, 2)
     noise[0] = 1.0 - 1e-8  # rounding at the edge of the distribution
     actions, _ = distribution.sample(noise)
@@ -107,7 +109,7 @@ def test_frequencies_follow_the_probabilities():
     layout = action_layout(spaces.Tuple((spaces.Discrete(3), spaces.MultiBinary(1))))
     logits = torch.log(torch.tensor([[0.2, 0.5, 0.3, 0.0]]))
     logits[0, 3] = math.log(0.7 / 0.3)
-    distribution = Distribution(layout, logits.expand(40_000, 4))
+    distribution = Distribution(layout.components, logits.expand(40_000, 4))
     actions, _ = distribution.sample(torch.rand(40_000, 2, generator=torch.Generator().manual_seed(0)))
     shares = [float((actions[:, 0] == k).float().mean()) for k in range(3)]
     assert shares == pytest.approx([0.2, 0.5, 0.3], abs=0.01)
@@ -125,7 +127,7 @@ def test_entropies_are_those_of_the_maths_to_the_bit():
     for log_std in (torch.randn(4, generator=generator), torch.randn(6, 4, generator=generator)):
         wanted = divergence.categorical_entropy(logits[:, :5]) + divergence.bernoulli_entropy(logits[:, 5:])
         wanted = wanted + divergence.gaussian_entropy(log_std.expand(6, 4))
-        assert torch.equal(Distribution(layout, parameters, log_std, mask).entropy(), wanted)
+        assert torch.equal(Distribution(layout.components, parameters, log_std, mask).entropy(), wanted)
 
 
 @pytest.mark.parametrize("engine", ["torch", "auto"])

@@ -17,9 +17,9 @@ import tightrope
 from tightrope.control import train
 from tightrope.control.agent import Agent
 from tightrope.control.environments import state as states
+from tightrope.control.environments.episode import EVALUATION, TRAINING, episode_seed
 from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.control.environments.make import make_environments
-from tightrope.control.environments.seeds import EVALUATION, TRAINING, episode_seed
 from tightrope.control.environments.tasks import make_vector_by_id, resets_rows_with_seeds
 from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve

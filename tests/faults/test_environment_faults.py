@@ -21,10 +21,10 @@ from gymnasium import spaces
 
 import tightrope
 from tightrope.cli.main import main
+from tightrope.control.environments.episode import TRAINING, episode_seed
 from tightrope.control.environments.faults import EnvironmentFault, FaultPolicy, pause
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.processes import STEP
-from tightrope.control.environments.seeds import TRAINING, episode_seed
 from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import BadNumbers
 from tightrope.control.train import resume, train

@@ -29,7 +29,6 @@ from tightrope.control.engine.choose import choose_engine, usable_device
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import FailedEpisode, policy_of, require_finite
 from tightrope.control.environments.make import make_environments
-from tightrope.control.environments.masks import flat_mask
 from tightrope.control.environments.processes import available_cores
 from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.policy.normalise import Normalisers
@@ -86,7 +85,7 @@ class Agent:
         self.optimiser = make_optimiser(
             self.policy.parameters(), self.policy.critic_parameters(), present.update
         )
-        self.normalisers = Normalisers.of(layouts[0], self.environments.num_envs, present)
+        self.normalisers = Normalisers.of(layouts[0].continuous, self.environments.num_envs, present)
         self.cores = available_cores()
         self.engine, self.engine_line = choose_engine(
             self.policy, self.optimiser, present, self.cores, notify
@@ -286,7 +285,7 @@ class Agent:
         batched = layout.is_batched(observation)
         inputs = layout.encode(observation, batched=batched)
         masks = layout.mask_of(observation) if action_masks is None else action_masks
-        action_mask = flat_mask(masks, len(next(iter(inputs.values()))), actions)
+        action_mask = actions.allowed(masks, len(next(iter(inputs.values()))))
         matrix = self.choose(inputs, action_mask, None if deterministic else self.predict_rng)
         return (actions.to_env(matrix) if batched else actions.to_env_single(matrix[0])), None
 

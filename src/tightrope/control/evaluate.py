@@ -10,9 +10,9 @@ import numpy as np
 
 from tightrope.control.environments import copies
 from tightrope.control.environments.base import Environments
+from tightrope.control.environments.episode import EVALUATION
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
-from tightrope.control.environments.seeds import EVALUATION
 from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.control.spaces.structure import Reading
@@ -36,7 +36,7 @@ def evaluate_agent(
     Every copy plays its own fixed share of the episodes, so that short episodes are not counted more often
     than long ones. One that has not ended after ``max_steps`` counts as it stands, and its copy waits for the
     others: then all are reset. Gives ``mean_return``, ``std_return``, ``ci95`` (half width), ``mean_length``,
-    ``episodes``, ``returns``, ``cut_episodes``, and where episodes tell (success.py), ``success_rate``.
+    ``episodes``, ``returns``, ``cut_episodes``, and where episodes tell (masks.py), ``success_rate``.
     The global generators start from ``seed``, and continue afterwards as if nothing had been drawn.
     """
     with generators.apart(seed):

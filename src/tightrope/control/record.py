@@ -125,8 +125,8 @@ def _play(agent: Agent, task: gym.Env, target: Path, episodes: int, seed: int) -
     try:
         for episode in range(episodes):
             observation, info = task.reset(seed=seed + episode)
-            layouts = (agent.environments.observation_layout, agent.environments.action_layout)
-            masks = find_source(task, info, *layouts)
+            observed = agent.environments.observation_layout.has_mask
+            masks = find_source(task, info, observed, agent.environments.action_layout.num_logits)
             total, over = 0.0, False
             while not over and frames < MAX_FRAMES:
                 frame = _frame(task, agent.settings.env)

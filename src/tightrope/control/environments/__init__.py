@@ -1,6 +1,6 @@
 """Copies of a task behind reset and step."""
 
 __all__ = [
-    "base", "copies", "faults", "make", "masks", "pool", "processes", "seeds", "state", "tasks",
+    "base", "copies", "episode", "faults", "make", "masks", "pool", "processes", "state", "tasks",
     "vector", "watchdog",
 ]  # fmt: skip

@@ -1,34 +1,18 @@
-"""What steps B environments: the interface, and what a step returns."""
+"""What steps B environments: the interface."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from tightrope.control.environments.episode import TRAINING, Seeding, Start, Step
 from tightrope.control.environments.faults import FaultPolicy, Restarts
-from tightrope.control.environments.seeds import TRAINING, Seeding, Start
 from tightrope.control.spaces.actions import ActionLayout
 from tightrope.control.spaces.observations import ObservationLayout
 from tightrope.control.spaces.structure import Inputs, Reading
-
-
-class Step(NamedTuple):
-    """What one step of all B environments returned; rewards and flags are valid until the next step."""
-
-    inputs: Inputs  # what the next action is chosen from
-    action_mask: np.ndarray | None  # bool [B, L], for the next action
-    rewards: np.ndarray  # float64 [B]
-    terminated: np.ndarray  # bool [B]
-    truncated: np.ndarray  # bool [B]; never True where terminated is
-    phantom: np.ndarray | None = None  # bool [B]: NEXT_STEP's reset, not a transition; None: none here
-    final_rows: np.ndarray | None = None  # int [F]: truncated rows whose ``inputs`` are the next episode's
-    final_inputs: Inputs | None = None  # [F, ...]: the true last observations of these rows
-    cut: np.ndarray | None = None  # bool [B]: restarted after a fault; this step did not take place there
-    success: np.ndarray | None = None  # float64 [B]: of episodes that ended here; NaN: not said (success.py)
-    origins: np.ndarray | None = None  # where an episode ended: the first two of `Environments.origins`
 
 
 class Environments(ABC):

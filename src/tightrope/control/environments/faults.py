@@ -18,7 +18,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from tightrope.control.spaces.structure import Inputs
 from tightrope.errors import TightropeError
 from tightrope.runs import signals
 
@@ -237,7 +236,7 @@ def kind_of(value: Any) -> str:
 # --------------------------------------------------------------------------------------------------- checks
 
 
-def float_parts(inputs: Inputs) -> list[np.ndarray]:
+def float_parts(inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
     """The inputs that can hold a NaN, each with its rows' numbers in one axis: [N, K]."""
     return [x.reshape(len(x), -1) for x in inputs.values() if x.dtype.kind == "f"]
 

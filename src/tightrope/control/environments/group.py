@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from tightrope.control.environments import state as states
-from tightrope.control.environments.base import Step
+from tightrope.control.environments.episode import Seeding, Start, Step
 from tightrope.control.environments.faults import (
     RAISED,
     ApiBreak,
@@ -30,10 +30,8 @@ from tightrope.control.environments.faults import (
     kind_of,
     wait_before_restart,
 )
-from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, find_source
-from tightrope.control.environments.seeds import Seeding, Start
-from tightrope.control.environments.success import success_of
-from tightrope.control.environments.tasks import check_alike, close_environment, make_all, renew_world
+from tightrope.control.environments.masks import NOTHING_ALLOWED, MaskSource, find_source, success_of
+from tightrope.control.environments.tasks import close_environment, make_all, renew_world
 from tightrope.control.environments.watchdog import limited
 from tightrope.control.spaces.actions import ActionLayout, action_layout
 from tightrope.control.spaces.observations import ObservationLayout, observation_layout
@@ -328,7 +326,9 @@ class EnvGroup:
     # ------------------------------------------------------------------------------------------------- masks
 
     def _find_mask(self, row: int, info: dict[str, Any]) -> None:
-        source = find_source(self.envs[row], info, self.observation_layout, self.action_layout)
+        source = find_source(
+            self.envs[row], info, self.observation_layout.has_mask, self.action_layout.num_logits
+        )
         self._mask_sources[row] = source
         self.has_masks = source.kind != "none"
         if source.kind != self._mask_sources[0].kind:
@@ -422,6 +422,18 @@ class _Waiting:
 
 def _awake(env: Any) -> Any:
     return env.env if isinstance(env, _Waiting) else env
+
+
+def check_alike(
+    envs: Sequence[gym.Env], observations: ObservationLayout, actions: ActionLayout, name: str
+) -> None:
+    """ValueError when the copies' observations or actions differ in shape, or the bounds of actions."""
+    for env in envs:
+        if not (observations.fits(env.observation_space) and actions.fits(env.action_space)):
+            raise ValueError(
+                f"the copies of {name} differ: {env.observation_space}, {env.action_space} against "
+                f"{observations.space}, {actions.space}. All copies must have the same spaces."
+            )
 
 
 def _check_reset(result: Any) -> tuple[Any, dict[str, Any]]:

@@ -1,12 +1,14 @@
-"""Action masks: where an environment gives them, and reading them.
+"""What environments tell beside observations and rewards: action masks, and whether an episode succeeded.
 
 An environment gives masks in ``info["action_mask"]``, by a method ``action_masks()``, or inside a Dict
-observation under "action_mask"; the first of these that it has is used. True allows a choice.
+observation under "action_mask"; the first of these that it has is used. True allows a choice. Whether an
+episode reached its goal stands in ``info["is_success"]`` of its last step, where a task gives it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -15,11 +17,9 @@ import gymnasium as gym
 import numpy as np
 
 from tightrope.control.environments.faults import ApiBreak
-from tightrope.control.spaces.actions import ActionLayout
-from tightrope.control.spaces.observations import ObservationLayout
 from tightrope.control.spaces.structure import MASK_KEY
 
-METHOD = "action_masks"
+METHOD, SUCCESS_KEY = "action_masks", "is_success"
 MISSING = f"info has no {MASK_KEY!r} although reset gave one; give it at every reset and every step"
 NOTHING_ALLOWED = "the action mask forbids every choice; allow at least one"
 
@@ -43,18 +43,19 @@ class MaskSource:
         return observation[MASK_KEY] if self.kind == "observation" else None
 
 
-def find_source(
-    env: Any, info: dict[str, Any], observations: ObservationLayout, actions: ActionLayout
-) -> MaskSource:
-    """The source of the masks of a single or a vector environment whose reset returned ``info``."""
-    if not actions.num_logits:
+def find_source(env: Any, info: dict[str, Any], observed: bool, num_logits: int) -> MaskSource:
+    """The source of the masks of a single or a vector environment whose reset returned ``info``.
+
+    ``observed``: a Dict observation has one; ``num_logits``: choices of the actions that a mask could forbid.
+    """
+    if not num_logits:
         return MaskSource()  # there is nothing that a mask could forbid
     if MASK_KEY in info:
         return MaskSource("info")
     method = _method_of(env) if isinstance(env, gym.Env) else _method_of_vector(env.unwrapped)
     if method is not None:
         return MaskSource("method", method)
-    return MaskSource("observation" if observations.has_mask else "none")
+    return MaskSource("observation" if observed else "none")
 
 
 def _method_of(env: gym.Env) -> Callable[[], Any] | None:
@@ -79,47 +80,34 @@ def _method_of_vector(env: Any) -> Callable[[], Any] | None:
     return (lambda: np.stack([np.asarray(mask) for mask in env.call(METHOD)])) if found else None
 
 
-def flat_mask(mask: Any, rows: int, actions: ActionLayout) -> np.ndarray | None:
-    """Masks in any form that `ActionLayout.flatten_mask` takes, as bool [rows, L]; None stays None.
-
-    ValueError: another shape, or a row that allows no choice.
+def success_of(info: dict[str, Any]) -> float:
+    """The number in the info of an episode's last step, 1 for True; NaN: it says nothing. ApiBreak for what
+    is no number.
     """
-    flat = actions.flatten_mask(mask, rows)
-    if flat is not None and len(blocked := actions.blocked_rows(flat)):
-        raise ValueError(f"action_masks forbid every choice in row {blocked[0]}; allow at least one.")
-    return flat
+    value = info.get(SUCCESS_KEY)
+    if value is None:
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ApiBreak(f"info[{SUCCESS_KEY!r}] is {value!r}, expected True or False") from None
 
 
-def vector_masks(
-    source: MaskSource,
-    observations: Any,
-    infos: dict[str, Any],
-    idle: np.ndarray | None,
-    actions: ActionLayout,
-    rows: int,
-) -> np.ndarray | None:
-    """The masks [B, L] of a vector environment; ``idle`` rows, whose next action is not used, allow all.
+def vector_success(infos: dict[str, Any], ended: np.ndarray) -> np.ndarray | None:
+    """float64 [B]: `success_of` for the rows that ``ended`` in this step, NaN elsewhere; None: none tells.
 
-    ApiBreak: masks are missing, have another shape, or allow no choice.
+    Where the row is reset in the same step, its last info is in ``final_info``.
     """
-    if source.kind == "none":
+    finals = infos.get("final_info", infos)
+    if isinstance(finals, dict) and SUCCESS_KEY not in finals:
         return None
-    needed = np.ones(rows, bool) if idle is None else ~idle
-    masks = np.ones((rows, actions.num_logits), bool)
-    if not needed.any():
-        return masks
-    raw = source.read(observations, infos)
-    given = infos.get(f"_{MASK_KEY}") if source.kind == "info" else None  # which rows have one
-    if given is not None and not np.asarray(given)[needed].all():
-        raise ApiBreak(MISSING)
-    if given is not None and isinstance(raw, np.ndarray) and raw.dtype == object:
-        for row in np.flatnonzero(given):
-            masks[row] = actions.flatten_mask(raw[row], 1)
-    else:
-        flat = actions.flatten_mask(raw, rows)
-        assert flat is not None
-        masks = flat
-    masks[~needed] = True
-    if len(blocked := actions.blocked_rows(masks)):
-        raise ApiBreak(NOTHING_ALLOWED, int(blocked[0]))
-    return masks
+    found = np.full(len(ended), np.nan)
+    for row in np.flatnonzero(ended):
+        if not isinstance(finals, dict):  # an array with an info a row
+            info = finals[row] or {}
+        else:
+            info = (
+                {SUCCESS_KEY: finals[SUCCESS_KEY][row]} if finals.get(f"_{SUCCESS_KEY}", ended)[row] else {}
+            )
+        found[row] = success_of(info)
+    return found

@@ -26,7 +26,8 @@ from typing import Any, final
 import gymnasium as gym
 import numpy as np
 
-from tightrope.control.environments.base import Environments, Step
+from tightrope.control.environments.base import Environments
+from tightrope.control.environments.episode import Seeding, Start, Step
 from tightrope.control.environments.faults import (
     RAISED,
     EnvironmentFault,
@@ -34,7 +35,7 @@ from tightrope.control.environments.faults import (
     action_text,
     wait_before_restart,
 )
-from tightrope.control.environments.group import EnvGroup, StepBuffers
+from tightrope.control.environments.group import EnvGroup, StepBuffers, check_alike
 from tightrope.control.environments.processes import (
     BROKEN,
     CARRIED,
@@ -58,9 +59,8 @@ from tightrope.control.environments.processes import (
     receive_soon,
     start_context,
 )
-from tightrope.control.environments.seeds import Seeding, Start
 from tightrope.control.environments.state import gives_state
-from tightrope.control.environments.tasks import check_alike, close_environment, make_all
+from tightrope.control.environments.tasks import close_environment, make_all
 from tightrope.control.environments.watchdog import Watchdog, limited
 from tightrope.control.spaces.actions import action_layout
 from tightrope.control.spaces.observations import observation_layout

@@ -16,9 +16,6 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from tightrope.control.environments.faults import RAISED, EnvironmentTimeout, fault_while, raised_here
-from tightrope.control.spaces.actions import ActionLayout
-from tightrope.control.spaces.observations import ObservationLayout
-from tightrope.control.spaces.structure import bounds_of, selected, structure
 
 # namespace or entry point module -> the module that must be there, and our extra that installs it
 EXTRAS = {
@@ -338,18 +335,3 @@ def close_environment(env: Any, index: int, limit: Limit = contextlib.nullcontex
             env.close()
     except RAISED as error:
         raise fault_while("Closing", index, error) from error
-
-
-def check_alike(
-    envs: Sequence[gym.Env], observations: ObservationLayout, actions: ActionLayout, name: str
-) -> None:
-    """ValueError when the copies' observations or actions differ in shape, or the bounds of actions."""
-    for env in envs:
-        seen = selected(env.observation_space, observations.keys)
-        pairs = ((observations.space, seen), (actions.space, env.action_space))
-        same = all(structure(ours) == structure(theirs) for ours, theirs in pairs)
-        if not same or bounds_of(env.action_space) != bounds_of(actions.space):
-            raise ValueError(
-                f"the copies of {name} differ: {env.observation_space}, {env.action_space} against "
-                f"{observations.space}, {actions.space}. All copies must have the same spaces."
-            )

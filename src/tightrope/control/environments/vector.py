@@ -22,7 +22,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from tightrope.control.environments import state as states
 from tightrope.control.environments import tasks
-from tightrope.control.environments.base import Environments, Step
+from tightrope.control.environments.base import Environments
+from tightrope.control.environments.episode import Start, Step
 from tightrope.control.environments.faults import (
     RAISED,
     ApiBreak,
@@ -35,14 +36,18 @@ from tightrope.control.environments.faults import (
     kind_of,
     wait_before_restart,
 )
-from tightrope.control.environments.masks import find_source, vector_masks
-from tightrope.control.environments.seeds import Start
-from tightrope.control.environments.success import SUCCESS_KEY, vector_success
+from tightrope.control.environments.masks import (
+    MISSING,
+    NOTHING_ALLOWED,
+    SUCCESS_KEY,
+    find_source,
+    vector_success,
+)
 from tightrope.control.environments.tasks import close_environment
 from tightrope.control.environments.watchdog import Watchdog, limited
 from tightrope.control.spaces.actions import action_layout
 from tightrope.control.spaces.observations import observation_layout
-from tightrope.control.spaces.structure import Inputs, Reading
+from tightrope.control.spaces.structure import MASK_KEY, Inputs, Reading
 
 # the second is a typing error in some of Gymnasium's environments
 MODE_KEYS = ("autoreset_mode", "autoreseet-mode")
@@ -166,7 +171,9 @@ class VectorEnvironments(Environments):
             if not (isinstance(result, tuple) and len(result) == 2):
                 raise ApiBreak(f"reset returned {kind_of(result)}, expected the pair (observations, infos)")
             observations, infos = result
-            self._mask_source = find_source(env, infos, self.observation_layout, self.action_layout)
+            self._mask_source = find_source(
+                env, infos, self.observation_layout.has_mask, self.action_layout.num_logits
+            )
             inputs = self._encode(observations)
             masks = self._masks(observations, infos, None)
             self._check_finite(inputs, "observation")
@@ -356,7 +363,31 @@ class VectorEnvironments(Environments):
         return {name: array[rows] for name, array in whole.items()}
 
     def _masks(self, observations: Any, infos: dict[str, Any], idle: np.ndarray | None) -> np.ndarray | None:
-        return vector_masks(self._mask_source, observations, infos, idle, self.action_layout, self.num_envs)
+        """The masks [B, L]; ``idle`` rows, whose next action is not used, allow all. ApiBreak: masks are
+        missing, have another shape, or allow no choice.
+        """
+        source, actions = self._mask_source, self.action_layout
+        if source.kind == "none":
+            return None
+        needed = np.ones(self.num_envs, bool) if idle is None else ~idle
+        masks = np.ones((self.num_envs, actions.num_logits), bool)
+        if not needed.any():
+            return masks
+        raw = source.read(observations, infos)
+        given = infos.get(f"_{MASK_KEY}") if source.kind == "info" else None  # which rows have one
+        if given is not None and not np.asarray(given)[needed].all():
+            raise ApiBreak(MISSING)
+        if given is not None and isinstance(raw, np.ndarray) and raw.dtype == object:
+            for row in np.flatnonzero(given):
+                masks[row] = actions.flatten_mask(raw[row], 1)
+        else:
+            flat = actions.flatten_mask(raw, self.num_envs)
+            assert flat is not None
+            masks = flat
+        masks[~needed] = True
+        if len(blocked := actions.blocked_rows(masks)):
+            raise ApiBreak(NOTHING_ALLOWED, int(blocked[0]))
+        return masks
 
     # ------------------------------------------------------------------------------------------------ faults
 

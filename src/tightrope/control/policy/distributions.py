@@ -8,6 +8,7 @@ that the compiled engine and this module draw the very same actions.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tightrope.control.spaces.actions import ActionLayout, Component
+from tightrope.control.spaces.structure import Component
 from tightrope.maths import divergence
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -59,7 +60,7 @@ class Distribution:
     bounds of this half width, None: not squashed.
     """
 
-    layout: ActionLayout
+    components: Sequence[Component]
     parameters: Tensor
     log_std: Tensor | None = None
     mask: Tensor | None = None
@@ -74,7 +75,7 @@ class Distribution:
     def sample(self, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Actions [N, A] made of the given noise [N, A], and their log-probabilities [N]."""
         parts = []
-        for component in self.layout.components:
+        for component in self.components:
             u = noise[:, component.column : component.column + component.width]
             if component.kind == "gaussian":
                 mean, log_std = self._gaussian(component)
@@ -89,7 +90,7 @@ class Distribution:
     def mode(self) -> Tensor:
         """The most likely action [N, A] (Gaussian: the mean, squashed or not)."""
         parts = []
-        for component in self.layout.components:
+        for component in self.components:
             if component.kind == "gaussian":
                 parts.append(self._gaussian(component)[0])
             elif component.kind == "bernoulli":
@@ -101,7 +102,7 @@ class Distribution:
     def logp(self, actions: Tensor) -> Tensor:
         """log pi(a) [N] of actions [N, A]; squashed: the density in the environment's units."""
         total = torch.zeros(len(actions), device=actions.device)
-        for component in self.layout.components:
+        for component in self.components:
             x = actions[:, component.column : component.column + component.width]
             if component.kind == "gaussian":
                 mean, log_std = self._gaussian(component)
@@ -121,7 +122,7 @@ class Distribution:
     def entropy(self) -> Tensor:
         """Entropy [N] in nats; of a squashed Gaussian by 16-point Gauss-Hermite quadrature per dimension."""
         total = torch.zeros(len(self.parameters), device=self.parameters.device)
-        for component in self.layout.components:
+        for component in self.components:
             if component.kind == "gaussian":
                 mean, log_std = self._gaussian(component)
                 each = divergence.gaussian_entropy(log_std[..., None]).expand_as(mean)

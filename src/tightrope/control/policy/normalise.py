@@ -13,7 +13,6 @@ import torch
 from tightrope.algorithms.batch import scale_metrics
 from tightrope.algorithms.nonfinite import require_restorable
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces.observations import ObservationLayout
 from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.maths.statistics import RunningMoments
 from tightrope.maths.values import ReturnScale
@@ -136,10 +135,10 @@ class Normalisers:
         self.observations, self.rewards, self.returns = observations, rewards, returns
 
     @classmethod
-    def of(cls, layout: ObservationLayout, num_envs: int, settings: TrainSettings) -> Normalisers:
-        """Those that a run's settings ask for."""
-        seen = settings.normalise_observations and bool(layout.size)
-        observations = ObservationNormaliser(layout.continuous, settings.encoder == "old") if seen else None
+    def of(cls, continuous: Array, num_envs: int, settings: TrainSettings) -> Normalisers:
+        """Those that a run's settings ask for; ``continuous`` bool [D]: as in ObservationLayout."""
+        seen = settings.normalise_observations and len(continuous) > 0
+        observations = ObservationNormaliser(continuous, settings.encoder == "old") if seen else None
         rewards = RewardNormaliser(num_envs, settings.update.gamma) if settings.normalise_rewards else None
         # without a baseline there is no critic to learn anything
         learned = settings.update.normalise_values and getattr(settings.update, "baseline", True)

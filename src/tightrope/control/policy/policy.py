@@ -256,7 +256,9 @@ class Policy(nn.Module):
             assert latent is not None and self.log_std is not None
             variance = latent.detach().square() @ (2.0 * bounded(self.log_std)).exp()
             log_std = 0.5 * torch.log(variance + 1e-6)
-        return Distribution(self.layout, parameters, log_std, inputs.get("action_mask"), self.half_range)
+        return Distribution(
+            self.layout.components, parameters, log_std, inputs.get("action_mask"), self.half_range
+        )
 
     def _own_outputs(self, inputs: InputTensors) -> tuple[Tensor, Tensor]:
         assert self.own is not None

@@ -13,6 +13,7 @@ from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
 from tightrope.control.engine.base import Acted, Engine
 from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments
+from tightrope.control.environments.episode import Start
 from tightrope.control.environments.faults import (
     FLOAT32_MAX,
     EnvironmentFault,
@@ -22,7 +23,6 @@ from tightrope.control.environments.faults import (
     first_unusable,
     float_parts,
 )
-from tightrope.control.environments.seeds import Start
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.rollout import replay
 from tightrope.control.rollout.rollout import Rollout

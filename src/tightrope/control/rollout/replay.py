@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tightrope.control.environments.base import Environments
-from tightrope.control.environments.seeds import TRAINING, Start
+from tightrope.control.environments.episode import TRAINING, Start
 from tightrope.control.spaces.structure import Array, Inputs
 
 PRINTS = 2  # int32 columns of a fingerprint: the observation; reward, mask and flags

@@ -17,27 +17,17 @@ from gymnasium import Space, spaces
 
 from tightrope.control.spaces.structure import (
     BOUND_LIMIT,
+    Component,
     Path,
+    bounds_of,
     categories,
     follow,
     nest,
     place_of,
+    structure,
     useful_bounds,
     walk,
 )
-
-
-@dataclass(frozen=True)
-class Component:
-    """One independent part of an action: its distribution and its places in parameters, columns and mask."""
-
-    kind: Literal["categorical", "bernoulli", "gaussian"]
-    parameter: int  # first of its parameters among the actor's P outputs
-    count: int  # categories, bits, or dimensions
-    column: int  # first of its columns in the action matrix
-    width: int  # how many columns: one index, or one a bit or dimension
-    mask: int  # first of its entries in the flat mask; -1 for gaussian
-    deviation: int  # first of its entries in a vector of all Gaussian dimensions
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +107,11 @@ class ActionLayout:
             return iter(values[0])
         return (nest(self.space, iter(row)) for row in zip(*values, strict=True))
 
+    def fits(self, space: Space) -> bool:
+        """Whether a space has the same parts and bounds."""
+        same = structure(self.space) == structure(space)
+        return same and bounds_of(self.space) == bounds_of(space)
+
     def clipped_share(self, actions: np.ndarray) -> float | None:
         """The share of the numbers for bounded Box dimensions in [N, A] that lie outside what reaches the
         bounds, and so are cut off; None where nothing can be. A constant dimension does not count.
@@ -171,6 +166,13 @@ class ActionLayout:
                 raise self._mask_error(mask, num) from None
             start, stop = parts[0].mask, parts[-1].mask + parts[-1].count
             self._write_mask(part_mask, parts, flat[:, start:stop], mask)
+        return flat
+
+    def allowed(self, mask: Any, num: int) -> np.ndarray | None:
+        """`flatten_mask`; ValueError also for a row that allows no choice."""
+        flat = self.flatten_mask(mask, num)
+        if flat is not None and len(blocked := self.blocked_rows(flat)):
+            raise ValueError(f"action_masks forbid every choice in row {blocked[0]}; allow at least one.")
         return flat
 
     def _flat_mask(self, mask: Any, num: int) -> np.ndarray | None:

@@ -23,6 +23,7 @@ from tightrope.control.spaces.structure import (
     nest,
     place_of,
     selected,
+    structure,
     useful_bounds,
     walk,
 )
@@ -113,6 +114,10 @@ class ObservationLayout:
     has_mask: bool  # the Dict carries the action mask under "action_mask"; it is no input
     plain: bool  # one Box of rank 1: "flat" is the observation itself
     keys: tuple[str, ...] = ()  # of a Dict, those that are used; empty: all
+
+    def fits(self, space: Space) -> bool:
+        """Whether a space, of which only ``keys`` count, has the same parts; their bounds may differ."""
+        return structure(self.space) == structure(selected(space, self.keys))
 
     def allocate(self, num: int, zeros: Callable[..., np.ndarray] = np.zeros) -> Inputs:
         """Empty inputs for ``num`` observations; ``zeros(shape, dtype)`` makes the arrays."""

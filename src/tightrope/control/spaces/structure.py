@@ -6,7 +6,8 @@ Worker processes import this folder, so it needs numpy only.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from gymnasium import Space, spaces
@@ -31,6 +32,19 @@ class Reading(NamedTuple):
     def of(cls, settings: Any) -> Reading:
         """As a run's settings ask for."""
         return cls(settings.encoder, settings.action_bounds, settings.observation_keys)
+
+
+@dataclass(frozen=True)
+class Component:
+    """One independent part of an action: its distribution and its places in parameters, columns and mask."""
+
+    kind: Literal["categorical", "bernoulli", "gaussian"]
+    parameter: int  # first of its parameters among the actor's P outputs
+    count: int  # categories, bits, or dimensions
+    column: int  # first of its columns in the action matrix
+    width: int  # how many columns: one index, or one a bit or dimension
+    mask: int  # first of its entries in the flat mask; -1 for gaussian
+    deviation: int  # first of its entries in a vector of all Gaussian dimensions
 
 
 def walk(space: Space, what: str, path: Path = ()) -> Iterator[tuple[Path, Space]]:

@@ -1,4 +1,7 @@
-"""The seeds of episodes: each is a pure function of (run seed, stream, copy, episode)."""
+"""How episodes begin, and what a step of them returns.
+
+The seed of an episode is a pure function of (run seed, stream, copy, episode).
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+
+from tightrope.control.spaces.structure import Inputs
 
 TRAINING, EVALUATION, TESTS = 0x7274, 0x6576, 0x7465  # streams; no two share a seed, but by chance
 AT_ONCE = 256  # seeds that are drawn at once: 0.1 us each, 14 us one by one
@@ -56,3 +61,19 @@ class Start(NamedTuple):
     episode: int = 0
     wait: int = 0
     carried: object = None
+
+
+class Step(NamedTuple):
+    """What one step of all B environments returned; rewards and flags are valid until the next step."""
+
+    inputs: Inputs  # what the next action is chosen from
+    action_mask: np.ndarray | None  # bool [B, L], for the next action
+    rewards: np.ndarray  # float64 [B]
+    terminated: np.ndarray  # bool [B]
+    truncated: np.ndarray  # bool [B]; never True where terminated is
+    phantom: np.ndarray | None = None  # bool [B]: NEXT_STEP's reset, not a transition; None: none here
+    final_rows: np.ndarray | None = None  # int [F]: truncated rows whose ``inputs`` are the next episode's
+    final_inputs: Inputs | None = None  # [F, ...]: the true last observations of these rows
+    cut: np.ndarray | None = None  # bool [B]: restarted after a fault; this step did not take place there
+    success: np.ndarray | None = None  # float64 [B]: of episodes that ended here; NaN: not said (masks.py)
+    origins: np.ndarray | None = None  # where an episode ended: the first two of `Environments.origins`
