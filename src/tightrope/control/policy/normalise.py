@@ -167,13 +167,11 @@ class Normalisers:
             rollout.reward_statistics_taken = True
         return self.rewards(rollout.rewards)
 
-    def update(self, rollout: Any, *, rewards: bool = True) -> None:
-        """Move the statistics of observations and of ``rewards``: after the update on this rollout, or after
-        the warm-up.
-        """
+    def update(self, rollout: Any) -> None:
+        """Move the statistics of observations and rewards, after the update on this rollout."""
         if self.observations is not None:
             self.observations.update(rollout.raw[rollout.mask])
-        if rewards and self.rewards is not None and not rollout.reward_statistics_taken:
+        if self.rewards is not None and not rollout.reward_statistics_taken:
             self.rewards.update(rollout.rewards, rollout.ended, rollout.mask)
 
     def metrics(self) -> dict[str, float]:

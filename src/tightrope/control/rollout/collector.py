@@ -147,7 +147,8 @@ class Collector:
             for name, counted in earlier.items():
                 setattr(rollout, name, counted + getattr(rollout, name))
             if warm_up and not earlier:
-                self.normalisers.update(rollout, rewards=False)
+                assert self.normalisers.observations is not None
+                self.normalisers.observations.update(rollout.raw[rollout.mask])
                 earlier = rollout.counts()
         return rollout
 
