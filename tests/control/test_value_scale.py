@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 import tightrope
 from tightrope.algorithms.batch import moved_scale
+from tightrope.control.resolve import resolve
 from tightrope.control.rollout.rollout import to_batch
 from tightrope.control.settings import TrainSettings
 
@@ -83,6 +84,41 @@ def test_values_are_the_returns_of_the_task(how):
         expected.insert(0, worth)
     seen = (np.arange(env.length, dtype=np.float32) / env.length)[:, None]
     assert agent.value(seen) == pytest.approx(expected, rel=0.02)
+
+
+def test_values_of_long_episodes_are_exact_by_the_defaults():
+    """3,000 steps, paid at the end: a dozen rollouts of 256 steps each must hand the reward on."""
+    agent = tightrope.PPO(
+        chain(length=3_000), seed=0, gamma=0.999, num_envs=1, num_steps=2_048, evaluate_every=None, **QUIET
+    ).learn(150_000)
+    seen = np.arange(3_000, dtype=np.float32)[:, None] / 3_000
+    expected = 0.999 ** (2_999 - np.arange(3_000))
+    assert np.abs(agent.value(seen) - expected).mean() < 0.02
+
+
+def test_the_critic_has_a_lambda_of_its_own():
+    """With 1 its targets are sums of rewards up to the end or the bootstrap; advantages stay as they are."""
+    agent = tightrope.PPO(chain(length=7, step=1.0), **SMALL, **QUIET).learn(512)
+    assert agent.settings.critic_lambda == 1.0
+    rollout = agent.collector.collect(agent.engine, 32)
+    one, own = (
+        to_batch(rollout, agent.engine, agent.normalisers, agent.settings.update, value)
+        for value in (None, 1.0)
+    )
+    scale = agent.normalisers.returns
+    assert torch.equal(one.advantages, own.advantages)
+    before = torch.from_numpy(np.maximum.accumulate(rollout.ended[:, ::-1], 1)[:, ::-1].copy())
+    left = torch.from_numpy(np.rint(7 * (1 - rollout.raw[..., 0])))  # rewards of 1 until the end
+    expected = (1 - 0.99**left) / 0.01
+    assert scale.values(own.returns)[before].numpy() == pytest.approx(expected[before].numpy(), rel=1e-4)
+    assert not torch.equal(one.returns, own.returns)
+
+
+def test_presets_and_old_runs_have_one_lambda():
+    assert resolve("CartPole-v1").critic_lambda is None
+    old = TrainSettings().to_json()
+    del old["critic_lambda"]
+    assert TrainSettings.from_json(old).critic_lambda is None
 
 
 def test_a_new_critic_counts_for_nothing_and_a_later_one_keeps_its_values():

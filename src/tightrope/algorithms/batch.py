@@ -31,8 +31,9 @@ class Batch:
     """Steps to learn from. Everything per step is [B, T]; ``mask`` is True where a step counts.
 
     ``inputs`` is opaque: a dict of tensors whose leading axis is the row (control: [B, T, ...] observations).
-    ``actions`` is [B, T, ...]; ``old_logp`` is the log-probability at sampling; ``returns`` = advantages +
-    old values. The three are in units of the return, or as `in_scale` gives them.
+    ``actions`` is [B, T, ...]; ``old_logp`` is the log-probability at sampling; ``returns``, what the critic
+    learns, are old values + advantages of the critic's lambda. The three are in units of the return, or as
+    `in_scale` gives them.
     """
 
     inputs: dict[str, Tensor]

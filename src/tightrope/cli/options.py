@@ -36,7 +36,8 @@ PROGRAM = "tightrope"
 # The groups of train --help; every setting is in one.
 GROUPS = {
     "task": ("env_kwargs", "observation_keys", "algorithm", "total_steps", "seed"),
-    "rollout": ("num_envs", "num_steps", "action_bounds", "normalise_observations", "normalise_rewards"),
+    "rollout": ("num_envs", "num_steps", "action_bounds", "normalise_observations"),
+    "returns": ("normalise_rewards", "critic_lambda"),
     "networks": ("hidden", "activation", "shared", "encoder", "std", "log_std_init", "gsde_steps"),
     "update rule": (),
     "evaluation and saving": (

@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -231,13 +232,15 @@ class Agent:
                 self.notify(line)
             rollout = self.collector.collect(self.engine, columns, warm_up)
         collected = time.perf_counter()
-        batch, metrics = to_batch(rollout, self.engine, self.normalisers, present, True), dict[str, float]()
+        estimate = partial(to_batch, rollout, self.engine, self.normalisers, present)
+        critic_lambda = self.settings.critic_lambda
+        batch, metrics = estimate(critic_lambda, move=True), dict[str, float]()
         if bool(batch.mask.any()):
             metrics = self.engine.update(
                 batch,
                 present,
                 self.update_rng,
-                refresh=lambda _: to_batch(rollout, self.engine, self.normalisers, present).as_steps(),
+                refresh=lambda _: estimate(critic_lambda).as_steps(),
                 log_ratio_limit=self._log_ratio_limit(batch),
             )
             metrics["train/explained_variance"] = float(

@@ -126,6 +126,11 @@ def preset(
         values |= {"num_epochs": 4, "minibatch_size": 256, "clip": 0.1} if algorithm == "ppo" else {}
         return values
     values["normalise_observations"] = True
+    if algorithm == "ppo":
+        # with gae_lambda, a late reward moves about 1 / (1 - lambda) = 20 steps towards the start each time
+        # that an episode is seen: too slowly for thousands of steps. Images, whose actor shares the critic's
+        # layers, keep one lambda
+        values["critic_lambda"] = 1.0
     if kind == "continuous":
         values["log_std_init"] = -0.5
     if algorithm == "a2c":

@@ -93,10 +93,17 @@ def cut_shares(rollout: Rollout, environments: Environments, normalisers: Normal
 
 
 def to_batch(
-    rollout: Rollout, engine: Engine, normalisers: Normalisers, settings: UpdateSettings, move: bool = False
+    rollout: Rollout,
+    engine: Engine,
+    normalisers: Normalisers,
+    settings: UpdateSettings,
+    critic_lambda: float | None = None,
+    *,
+    move: bool = False,
 ) -> Batch:
     """Values, advantages and returns of a rollout, as a Batch [B, T] in the scale of returns.
 
+    The returns, which the critic learns, have ``critic_lambda`` (None: the lambda of advantages).
     ``move``: first the scale moves to these returns, and the critic's last layer with it, so that values
     stay; a module of the user's has to follow by learning.
     """
@@ -110,6 +117,7 @@ def to_batch(
         following = np.zeros_like(values)
     steps = Steps(rewards, values, following, rollout.terminated, rollout.ended, mask)
     advantages = engine.gae(steps, settings.gamma, settings.gae_lambda)
+    learned = advantages if critic_lambda is None else engine.gae(steps, settings.gamma, critic_lambda)
 
     def tensor(array: Array) -> torch.Tensor:
         return torch.from_numpy(array).to(engine.device)
@@ -120,7 +128,7 @@ def to_batch(
         old_logp=tensor(rollout.logp),
         old_values=tensor(values),
         advantages=tensor(advantages),
-        returns=tensor(advantages + values),
+        returns=tensor(learned + values),
         mask=tensor(mask),
     )
     kept = settings.normalise_advantages
