@@ -469,7 +469,9 @@ SUMMARY = {
 def clean_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     """Undo what a command may change: working folder, sys.path, modules."""
     path, folder = list(sys.path), os.getcwd()
-    before = {name: sys.modules.get(name) for name in ("tightrope.control.train", "tightrope.control.saving")}
+    before = {
+        name: sys.modules.get(name) for name in ("tightrope.control.train", "tightrope.control.evaluate")
+    }
     yield
     sys.path[:] = path
     os.chdir(folder)
@@ -584,9 +586,9 @@ def test_evaluate_passes_what_is_given_and_prints_the_interval(capsys: pytest.Ca
         seen.update(values, path=path)
         return {"mean_return": 100.0, "std_return": 10.0, "ci95": 2.0, "episodes": 96}
 
-    module = types.ModuleType("tightrope.control.saving")
+    module = types.ModuleType("tightrope.control.evaluate")
     module.evaluate_run = evaluate_run  # type: ignore[attr-defined]
-    sys.modules["tightrope.control.saving"] = module
+    sys.modules["tightrope.control.evaluate"] = module
     code, out, _ = run_main(capsys, "evaluate", "runs/a", "--episodes", "96", "--best")
     assert (code, seen) == (0, {"path": "runs/a", "episodes": 96, "best": True})
     assert "mean return 100.00" in out

@@ -33,7 +33,8 @@ MAY_IMPORT = {
     "control.engine.compiled": CORE,
     "control.engine": CORE
     | {f"control.{part}" for part in ("spaces", "policy", "engine.compiled", "settings")},
-    "control.rollout": CORE | {"control.spaces", "control.environments", "control.policy", "control.engine"},
+    "control.rollout": CORE
+    | {f"control.{part}" for part in ("spaces", "environments", "policy", "engine", "settings")},
     "control": CORE
     | {"training"}
     | {f"control.{part}" for part in ("spaces", "environments", "policy", "engine", "rollout")},

@@ -13,9 +13,9 @@ from gymnasium import spaces
 import tightrope
 from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.control.environments.make import make_environments
-from tightrope.control.evaluate import evaluate_agent, evaluation_environments
 from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import BadNumbers
+from tightrope.control.rollout.evaluation import evaluate_agent, evaluation_environments
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces.structure import Reading
 

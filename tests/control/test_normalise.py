@@ -212,7 +212,7 @@ def test_statistics_are_frozen_during_a_rollout_and_its_update():
 
 def test_evaluation_leaves_everything_as_it_is():
     agent = tightrope.PPO("CartPole-v1", seed=0, num_envs=2, num_steps=32, minibatch_size=32).learn(256)
-    from tightrope.control.evaluate import evaluate_agent, evaluation_environments
+    from tightrope.control.rollout.evaluation import evaluate_agent, evaluation_environments
 
     state = {k: x.clone() for k, x in agent.normalisers.state().items()}
     rng = agent.sampling_rng.bit_generator.state

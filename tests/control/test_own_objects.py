@@ -17,8 +17,8 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 import tightrope
 from tightrope.control.environments import copies
 from tightrope.control.environments.make import make_environments
-from tightrope.control.evaluate import evaluate_agent, evaluation_environments
-from tightrope.control.saving import evaluate_run
+from tightrope.control.evaluate import evaluate_run
+from tightrope.control.rollout.evaluation import evaluate_agent, evaluation_environments
 from tightrope.runs import generators
 
 F32 = np.float32

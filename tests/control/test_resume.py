@@ -21,8 +21,8 @@ from tightrope.control.environments.episode import EVALUATION, TRAINING, episode
 from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.tasks import make_vector_by_id, resets_rows_with_seeds
-from tightrope.control.evaluate import evaluate_agent
 from tightrope.control.resolve import resolve
+from tightrope.control.rollout.evaluation import evaluate_agent
 from tightrope.runs import checkpoint
 from tightrope.runs.run import Run
 from tightrope.training.learner import crosses

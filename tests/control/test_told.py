@@ -16,9 +16,9 @@ import tightrope
 from tightrope.algorithms.descent import SamplingMismatch
 from tightrope.cli.main import main
 from tightrope.control.environments.make import make_environments
-from tightrope.control.evaluate import evaluate_agent, step_limit
+from tightrope.control.evaluate import evaluate_run
 from tightrope.control.resolve import resolve
-from tightrope.control.saving import evaluate_run
+from tightrope.control.rollout.evaluation import evaluate_agent, step_limit
 from tightrope.control.train import resume, train
 from tightrope.runs.run import Run
 from tightrope.training.events import Message, Stop, Updated

@@ -485,7 +485,7 @@ def test_a_vector_version_of_an_id_is_restarted_with_all_its_copies():
 
 
 def test_evaluation_leaves_out_what_a_fault_cut(agent_on):
-    from tightrope.control.evaluate import evaluate_agent
+    from tightrope.control.rollout.evaluation import evaluate_agent
 
     agent = agent_on("no", "serial")
     policy = FaultPolicy(restart=True, max_restarts=5)

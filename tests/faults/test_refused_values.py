@@ -16,9 +16,9 @@ from gymnasium import spaces
 import tightrope
 from tightrope.cli.main import main
 from tightrope.control.environments.faults import EnvironmentFault
+from tightrope.control.evaluate import evaluate_run
 from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import BadNumbers
-from tightrope.control.saving import evaluate_run
 from tightrope.control.train import resume, train
 from tightrope.language.alignment.align import resume_align
 from tightrope.language.compare import sample_run

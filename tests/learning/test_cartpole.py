@@ -6,7 +6,7 @@ import pytest
 
 import tightrope
 from tightrope.cli.main import main
-from tightrope.control.evaluate import evaluate_agent, evaluation_environments
+from tightrope.control.rollout.evaluation import evaluate_agent, evaluation_environments
 
 
 def score(agent, episodes=20):

@@ -18,7 +18,7 @@ import torch
 import tightrope
 from tightrope.cli.main import main
 from tightrope.control import train
-from tightrope.control.saving import evaluate_run
+from tightrope.control.evaluate import evaluate_run
 from tightrope.runs import checkpoint
 from tightrope.runs.records import dumps
 from tightrope.runs.run import Run

@@ -20,8 +20,8 @@ from language.tiny import saved, tiny_llama
 from threadpoolctl import threadpool_info
 
 import tightrope
+from tightrope.control.evaluate import evaluate_run
 from tightrope.control.record import record_run
-from tightrope.control.saving import evaluate_run
 from tightrope.control.settings import TrainSettings
 from tightrope.control.train import resume, train
 from tightrope.language.alignment.align import align, resume_align

@@ -123,7 +123,7 @@ run()
 SAVING = "tightrope.runs.durable.put SAVING"
 COLLECTING = "tightrope.control.environments.pool.EnvironmentPool.receive COLLECTING 0.01"
 UPDATING = "tightrope.algorithms.ppo.update UPDATING 0.5"
-EVALUATING = "tightrope.control.evaluate.evaluate_agent EVALUATING 600"
+EVALUATING = "tightrope.control.rollout.evaluation.evaluate_agent EVALUATING 600"
 TRAIN = [
     "train", "Pendulum-v1", "--total-steps", "2_000_000", "--num-envs", "4", "--num-steps", "50",
     "--minibatch-size", "100", "--engine", "torch", "--vector-backend", "workers", "--num-workers", "2",

@@ -40,7 +40,7 @@ def _evaluate(words: list[str]) -> int:
         given["run"] = os.path.abspath(given["run"])  # user code may change the working directory
     import_env_module(given)
     look_again(given)
-    from tightrope.control.saving import evaluate_run
+    from tightrope.control.evaluate import evaluate_run
 
     names = ("episodes", "stochastic", "best", "seed", "env", "device", "evaluation_max_steps")
     result = evaluate_run(given["run"], **{name: given[name] for name in names if name in given})

@@ -1,18 +1,15 @@
-"""Agents from a run folder, or from a folder that ``agent.save`` wrote: loading and evaluating them."""
+"""Agents from a run folder, or from a folder that ``agent.save`` wrote."""
 
 from __future__ import annotations
 
-import math
 import shlex
-import warnings
 from pathlib import Path
 from typing import Any
 
 from tightrope.control.agent import AGENTS, Agent
 from tightrope.control.environments.vector import is_vector_env
-from tightrope.control.evaluate import cut_text, evaluate_agent, evaluation_environments, step_limit
 from tightrope.control.resolve import anywhere
-from tightrope.control.settings import EVALUATION_SEED, TrainSettings
+from tightrope.control.settings import TrainSettings
 from tightrope.runs import checkpoint
 from tightrope.runs.durable import present
 from tightrope.runs.folders import require_kind
@@ -65,38 +62,6 @@ def load(
         agent.close()
         raise
     return agent
-
-
-def evaluate_run(
-    path: str | Path,
-    *,
-    episodes: int = 100,
-    stochastic: bool = False,
-    best: bool = False,
-    seed: int | None = None,
-    env: Any = None,
-    policy: Any = None,
-    device: str = "cpu",
-    evaluation_max_steps: int | None = None,
-) -> dict[str, Any]:
-    """Evaluate the policy of a run or of a saved folder; see evaluate_agent. ``max_steps`` in the result:
-    where an episode is cut, None where nothing cuts it; ``evaluation_max_steps`` None: as in training.
-    """
-    agent = load(path, env=env, policy=policy, best=best, device=device, engine="torch")  # nothing is learnt
-    try:
-        environments = evaluation_environments(agent.env, agent.settings, episodes)
-        seed = EVALUATION_SEED if seed is None else seed
-        limit = step_limit(agent.settings, environments, agent.episodes.longest)
-        limit = limit if evaluation_max_steps is None else evaluation_max_steps
-        how: dict[str, Any] = {"seed": seed, "deterministic": not stochastic, "max_steps": limit}
-        result = evaluate_agent(agent, environments, episodes, **how)
-        environments.close()
-    finally:
-        agent.close()
-    if text := cut_text(result, limit):
-        warnings.warn(text, stacklevel=2)
-    how["max_steps"] = limit if math.isfinite(limit) else None
-    return {**result, "step": agent.steps, **how}
 
 
 def name_again(path: str | Path, env: str, command: str) -> str:

@@ -11,10 +11,15 @@ from typing import Any
 from tightrope.control.agent import AGENTS, Agent
 from tightrope.control.environments.faults import EnvironmentFault, FailedEpisode
 from tightrope.control.environments.make import Environments
-from tightrope.control.evaluate import cut_text, evaluate_agent, evaluation_environments, step_limit
 from tightrope.control.repetition import Repetition
 from tightrope.control.resolve import resolve
 from tightrope.control.rollout.collector import BadNumbers
+from tightrope.control.rollout.evaluation import (
+    cut_text,
+    evaluate_agent,
+    evaluation_environments,
+    step_limit,
+)
 from tightrope.control.saving import name_again, rebuild
 from tightrope.control.settings import TrainSettings
 from tightrope.runs import signals
