@@ -246,6 +246,24 @@ def test_env_kwargs_reach_every_copy_and_are_saved(env: Any, backend: str, tmp_p
         tightrope.load(tmp_path / "agent", env="CartPole-v1")
 
 
+@pytest.mark.parametrize("env", ["own/Chosen-v0", Chosen], ids=["id", "class"])
+def test_a_policy_is_evaluated_with_other_env_kwargs(env: Any, tmp_path: Any) -> None:
+    agent = tightrope.PPO(env, env_kwargs={"good": 1, "scale": 2.0}, num_envs=2, **SMALL).learn(2_048)
+    agent.save(tmp_path / "agent")
+    agent.close()
+    other = None if isinstance(env, str) else env
+    found = evaluate_run(tmp_path / "agent", env=other, env_kwargs={"scale": 3.0}, episodes=3)
+    assert found["mean_return"] == 3.0  # of the run's, good stays 1
+    loaded = tightrope.load(tmp_path / "agent", env=other, env_kwargs={"good": 0})
+    assert loaded.settings.env_kwargs == {"good": 0, "scale": 2.0}
+    loaded.learn(64)  # in episodes of the other task: none is continued
+    loaded.close()
+    with pytest.raises(ValueError, match=r"does not take 'goo'. Did you mean good"):
+        tightrope.load(tmp_path / "agent", env=other, env_kwargs={"goo": 0})
+    with pytest.raises(ValueError, match="has been made"):
+        tightrope.load(tmp_path / "agent", env=Chosen(), env_kwargs={"good": 0})
+
+
 @pytest.mark.parametrize(
     ("env", "keywords", "words"),
     [

@@ -144,7 +144,7 @@ def add_fields(
             metavar, read = ("N", width) if whole else ("KEY", str)
             group.add_argument(flag, nargs="*", type=read, metavar=metavar, help=text)
         elif plain is dict:
-            group.add_argument(flag, nargs="*", type=pair, action=_Pairs, metavar="NAME=VALUE", help=text)
+            group.add_argument(flag, nargs="*", type=pair, action=Pairs, metavar="NAME=VALUE", help=text)
         else:
             choices = field.metadata["choices"]
             metavar = {str: "WORD", int: "N", float: "X"}[plain]
@@ -226,7 +226,7 @@ def pair(word: str) -> tuple[str, Any]:
     return name, value
 
 
-class _Pairs(argparse.Action):
+class Pairs(argparse.Action):
     """Collects pairs in a dict; the word none alone: no dict."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:

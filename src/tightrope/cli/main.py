@@ -42,7 +42,7 @@ def _evaluate(words: list[str]) -> int:
     look_again(given)
     from tightrope.control.evaluate import evaluate_run
 
-    names = ("episodes", "stochastic", "best", "seed", "env", "device", "evaluation_max_steps")
+    names = ("episodes", "stochastic", "best", "seed", "env", "env_kwargs", "device", "evaluation_max_steps")
     result = evaluate_run(given["run"], **{name: given[name] for name in names if name in given})
     if given.get("json"):
         print_json(result)
@@ -64,7 +64,7 @@ def _record(words: list[str]) -> int:
     look_again(given)
     from tightrope.control.record import record_run
 
-    names = ("out", "best", "episodes", "seed", "env")
+    names = ("out", "best", "episodes", "seed", "env", "env_kwargs")
     result = record_run(given["run"], **{name: given[name] for name in names if name in given})
     if given.get("json"):
         print_json(result)

@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from tightrope.cli.flags import (
+    Pairs,
     Parser,
     UsageError,
     add_fields,
+    pair,
     settings_fields,
     suggestion,
     unknown_flag,
@@ -175,6 +177,22 @@ def _common(parser: Parser, *, run: bool) -> None:
         )
 
 
+def _playing(group: argparse._ArgumentGroup) -> None:
+    """The options of a command that plays episodes: which policy, in which episodes."""
+    group.add_argument("--best", action="store_true", help="The policy that evaluated best, not the newest.")
+    group.add_argument(
+        "--seed", type=_not_negative, metavar="N", help="Seed of the episodes (default: fixed, unused)."
+    )
+    group.add_argument(
+        "--env-kwargs",
+        nargs="*",
+        type=pair,
+        action=Pairs,
+        metavar="NAME=VALUE",
+        help="Other arguments for the constructor of the task; those of the run stay (default: none).",
+    )
+
+
 def training_parser(command: str, algorithm: str = "ppo") -> Parser:
     """The options of a command that trains; those of ``train`` with this update rule."""
     usage, description, epilog = DESCRIPTIONS[command]
@@ -256,10 +274,7 @@ def evaluate_parser() -> Parser:
     group.add_argument(
         "--stochastic", action="store_true", help="Sample actions; default: the most likely one."
     )
-    group.add_argument("--best", action="store_true", help="The policy that evaluated best, not the newest.")
-    group.add_argument(
-        "--seed", type=_not_negative, metavar="N", help="Seed of the episodes (default: fixed, unused)."
-    )
+    _playing(group)
     group.add_argument("--device", metavar="WORD", help="Torch device of the networks (default cpu).")
     _common(parser, run=True)
     return parser
@@ -271,22 +286,14 @@ def record_parser() -> Parser:
     group = parser.add_argument_group("recording")
     group.add_argument("--out", metavar="FILE.mp4", help="Where to (default RUN/videos/).")
     group.add_argument("--episodes", type=_at_least_one, metavar="N", help="How many (default 1).")
-    group.add_argument("--best", action="store_true", help="The policy that evaluated best, not the newest.")
-    group.add_argument(
-        "--seed",
-        type=_not_negative,
-        metavar="N",
-        help="Seed of the episodes (default: fixed, unused in training).",
-    )
+    _playing(group)
     _common(parser, run=True)
     return parser
 
 
 def resume_parser() -> Parser:
     """The options of ``resume``."""
-    parser = _run_parser(
-        "resume", "Continue a run from its newest checkpoint, in the same folder.", "Run folder."
-    )
+    parser = _run_parser("resume", "Continue a run from its newest checkpoint, in its folder.", "Run folder.")
     group = parser.add_argument_group("continuing")
     group.add_argument(
         "--total-steps",
@@ -295,9 +302,7 @@ def resume_parser() -> Parser:
         help="A new end (align: responses); also continues a finished run (default: the run's own).",
     )
     group.add_argument(
-        "--reward",
-        metavar="R",
-        help="align: the reward again, if it was your own code (default: the run's).",
+        "--reward", metavar="R", help="align: the reward again, if it was your own code (default: the run's)."
     )
     group.add_argument(
         "--gold",
@@ -315,9 +320,8 @@ def resume_parser() -> Parser:
 
 def sample_parser() -> Parser:
     """The options of ``sample``."""
-    parser = _run_parser(
-        "sample", "Responses of the aligned model beside the reference's.", "Run folder of align."
-    )
+    text = "Responses of the aligned model beside the reference's."
+    parser = _run_parser("sample", text, "Run folder of align.")
     group = parser.add_argument_group("sampling")
     group.add_argument(
         "--prompt", action="append", metavar="TEXT", help="A prompt of your own; may be repeated."

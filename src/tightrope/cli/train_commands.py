@@ -109,7 +109,8 @@ def look_again(given: Options, settings: dict[str, Any] | None = None) -> None:
             return
     env = given.get("env", settings.get("env"))
     if isinstance(env, str) and ("env" in given or ":" not in env):  # no file may name what is imported
-        look_first(env, settings.get("env_kwargs") if env == settings.get("env") else None)
+        kept = (settings.get("env_kwargs") if env == settings.get("env") else None) or {}
+        look_first(env, {**kept, **(given.get("env_kwargs") or {})})
 
 
 def _functions(command: str) -> tuple[Training, Training]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,18 @@ def evaluate_run(
     best: bool = False,
     seed: int | None = None,
     env: Any = None,
+    env_kwargs: Mapping[str, Any] | None = None,
     policy: Any = None,
     device: str = "cpu",
     evaluation_max_steps: int | None = None,
 ) -> dict[str, Any]:
-    """Evaluate the policy of a run or of a saved folder; see evaluate_agent. ``max_steps`` in the result:
-    where an episode is cut, None where nothing cuts it; ``evaluation_max_steps`` None: as in training.
+    """Evaluate the policy of a run or of a saved folder; see `load` and `evaluate_agent`.
+
+    ``max_steps`` in the result: where an episode is cut, None where nothing cuts it; ``evaluation_max_steps``
+    None: as in training.
     """
-    agent = load(path, env=env, policy=policy, best=best, device=device, engine="torch")  # nothing is learnt
+    task = {"env": env, "env_kwargs": env_kwargs}
+    agent = load(path, **task, policy=policy, best=best, device=device, engine="torch")  # nothing is learnt
     try:
         environments = evaluation_environments(agent.env, agent.settings, episodes)
         seed = EVALUATION_SEED if seed is None else seed

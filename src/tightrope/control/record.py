@@ -6,7 +6,7 @@ import contextlib
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ def record_run(
     episodes: int = 1,
     seed: int | None = None,
     env: Any = None,
+    env_kwargs: Mapping[str, Any] | None = None,
     policy: Any = None,
 ) -> dict[str, Any]:
     """Record ``episodes`` deterministic episodes of a run or saved folder; gives path, frames, returns.
@@ -48,7 +49,7 @@ def record_run(
     with (
         _headless(),
         contextlib.closing(
-            load(path, env=env, policy=policy, best=best, engine="torch")  # nothing is learnt
+            load(path, env=env, env_kwargs=env_kwargs, policy=policy, best=best, engine="torch")
         ) as agent,
     ):
         task = _renderable(agent.env, agent.settings)

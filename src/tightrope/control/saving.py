@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ def load(
     path: str | Path,
     *,
     env: Any = None,
+    env_kwargs: Mapping[str, Any] | None = None,
     policy: Any = None,
     best: bool = False,
     device: str | None = None,
@@ -28,9 +30,10 @@ def load(
 ) -> Agent:
     """The agent of a run folder (its newest policy, ``best``: its best) or of a folder that ``save`` wrote.
 
-    ``env``: needed when the saved one was no plain Gymnasium id; another id is a warm start.  ``policy``:
-    needed when the saved policy was a module of your own.  ``engine``: who computes further updates (auto,
-    fused, torch); with another ``device`` it is chosen again.
+    ``env``: needed when the saved one was no plain Gymnasium id; another id is a warm start.
+    ``env_kwargs``: other arguments for the constructor, beside those of the run that they do not name.
+    ``policy``: needed when the saved policy was a module of your own.  ``engine``: who computes further
+    updates (auto, fused, torch); with another ``device`` it is chosen again.
     """
     folder, tensors, state = read(Path(path), best=best)
     with checkpoint.understood(folder):
@@ -51,12 +54,14 @@ def load(
         name = env if isinstance(env, str) else settings.env
         rows = env.num_envs if is_vector_env(env) else settings.num_envs
         settings = anywhere(settings, env, num_envs=rows).with_values(env=name)
+    if env_kwargs:
+        settings = settings.with_values(env_kwargs={**(settings.env_kwargs or {}), **env_kwargs})
     agent = rebuild(settings.env if env is None else env, path, policy=policy, settings=settings)
     try:
         agent.require_spaces(state)
         with checkpoint.understood(folder):
             agent.restore(tensors, state)
-        if env is not None and not own_environment:
+        if env_kwargs or (env is not None and not own_environment):
             agent.forget_episodes()  # a warm start on another task
     except BaseException:
         agent.close()

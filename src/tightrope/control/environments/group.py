@@ -455,7 +455,8 @@ def _check_step(result: Any, has_masks: bool) -> None:
         )
     _, reward, terminated, truncated, info = result
     if isinstance(reward, str | bytes | None) or np.ndim(reward) != 0:
-        raise ApiBreak(f"the reward is {reward!r}, expected one number")
+        several = ". Weigh several rewards into one in a wrapper" if np.ndim(reward) else ""
+        raise ApiBreak(f"the reward is {reward!r}, expected one number{several}")
     for name, flag in (("terminated", terminated), ("truncated", truncated)):
         if not isinstance(flag, bool | np.bool_ | int) or flag not in (True, False):
             raise ApiBreak(f"{name} is {flag!r}, expected True or False")
