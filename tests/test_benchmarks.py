@@ -7,7 +7,10 @@ import json
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -15,6 +18,7 @@ BENCHMARKS = ROOT / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import film_reviews  # noqa: E402
+import packages  # noqa: E402
 import scaling  # noqa: E402
 import speed  # noqa: E402
 import speed_peers  # noqa: E402
@@ -209,3 +213,33 @@ def test_committed_results_are_whole_runs():
     assert [s["name"] for s in results["scenarios"]] == [s["name"] for s in speed.SCENARIOS]
     assert all(len(s["pairs"]) >= 5 for s in results["scenarios"])
     assert "stable-baselines3" in results["peers"] and not results["quick"]
+
+
+class TwoRewards(gymnasium.Env):
+    """Its steps give as many rewards as its class says."""
+
+    observation_space = gymnasium.spaces.Discrete(2)
+    action_space = gymnasium.spaces.Discrete(2)
+    rewards: Any = 1.0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[int, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return 0, {}
+
+    def step(self, action: int) -> tuple[int, Any, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return self.steps % 2, self.rewards, self.steps == 9, False, {}
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_package_is_tried_in_every_way(several: bool, monkeypatch: pytest.MonkeyPatch):
+    """Stand-ins for packages: one that is right, one that must be refused."""
+    env = type("Task", (TwoRewards,), {"rewards": np.ones(2)}) if several else TwoRewards
+    refused = "one number. Weigh several rewards" if several else ""
+    row = packages.Package("gymnasium", "gymnasium", env, {"engine": "torch"}, 256, refused)
+    monkeypatch.setattr(packages, "PACKAGES", {"task": row})
+    found = packages.examined("task")
+    every = ["learn", "predict", "load", "train", "evaluate", "resume", "load of the run"]
+    assert found["right"] and found["held"] == ([] if several else every), found
+    assert bool(found["error"]) == several

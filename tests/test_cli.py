@@ -591,6 +591,8 @@ def test_evaluate_passes_what_is_given_and_prints_the_interval(capsys: pytest.Ca
     sys.modules["tightrope.control.evaluate"] = module
     code, out, _ = run_main(capsys, "evaluate", "runs/a", "--episodes", "96", "--best")
     assert (code, seen) == (0, {"path": "runs/a", "episodes": 96, "best": True})
+    run_main(capsys, "evaluate", "runs/a", "--env-kwargs", "gravity=-5", "map_name=4x4")
+    assert seen["env_kwargs"] == {"gravity": -5, "map_name": "4x4"}
     assert "mean return 100.00" in out
     assert "98.00 to 102.00" in out
     code, out, _ = run_main(capsys, "evaluate", "runs/a", "--json")

@@ -143,7 +143,7 @@ def run_broken(how: str, after: int = 0, num_workers: int = 1, timeout: float = 
         ("reset returns the observation alone", r"reset returned an array.*expected the pair.*old gym"),
         ("reset gives another shape", r"shape \(2,\), the space says \(3,\)"),
         ("four values", r"a tuple of 4 values, expected five"),
-        ("reward is an array", "expected one number"),
+        ("reward is an array", "expected one number.*several rewards"),
         ("reward is None", "reward is None"),
         ("flag is text", "terminated is 'no'"),
         ("shape changes", r"shape \(4,\), the space says \(3,\)"),
