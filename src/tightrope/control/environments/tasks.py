@@ -183,7 +183,7 @@ def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int, **keyw
     """EnvPool's version of a task; ValueError when EnvPool is missing or does not know the id."""
     try:
         import envpool
-    except ImportError as error:
+    except (ImportError, OSError) as error:  # OSError: its files of data are packages of their own
         raise ValueError(
             f"vector backend 'envpool' asked for, but EnvPool cannot be imported ({error}). "
             "Install it: pip install 'tightrope[envpool]'."

@@ -110,10 +110,10 @@ class VectorEnvironments(Environments):
         self._keep = keep
         self._int32 = int32_actions
         self._use(make(0))
-        self.observation_layout = observation_layout(
-            self._env.single_observation_space, reading.encoder, reading.keys
-        )
-        self.action_layout = action_layout(self._env.single_action_space, reading.action_bounds)
+        with tasks.without_noise():  # EnvPool makes its spaces when they are asked for
+            seen, actions = self._env.single_observation_space, self._env.single_action_space
+        self.observation_layout = observation_layout(seen, reading.encoder, reading.keys)
+        self.action_layout = action_layout(actions, reading.action_bounds)
         self.gives_state = states.gives_state(self._env)
         self.row_groups = (slice(0, self.num_envs),)  # they are stepped together
         self._episode = 0  # of which the seed was that of the last reset
