@@ -60,9 +60,9 @@ class Crafter(gym.Env):
         return self.game.reset(), {}
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict]:
-        seen, reward, done, info = self.game.step(action)
+        seen, reward, ended, info = self.game.step(action)
         dead = info["discount"] == 0
-        return seen, float(reward), done and dead, done and not dead, {}
+        return seen, float(reward), ended and dead, ended and not dead, {}
 
 
 class Package(NamedTuple):
@@ -166,12 +166,12 @@ def on_the_command_line(task: Package, folder: Path) -> Iterator[str]:
         ["evaluate", run, "--episodes", "2"],
         ["resume", run, "--total-steps", str(LAST)],
     ):
-        done = subprocess.run(
+        ended = subprocess.run(
             [sys.executable, "-m", "tightrope", *words, *module], capture_output=True, text=True
         )
-        if done.returncode:
-            raise RuntimeError(f"tightrope {words[0]}: code {done.returncode}: {done.stderr.strip()[-600:]}")
-        json.loads(done.stdout.splitlines()[-1])
+        if ended.returncode:
+            raise RuntimeError(f"tightrope {words[0]}: code {ended.returncode}: {ended.stderr.strip()[-600:]}")
+        json.loads(ended.stdout.splitlines()[-1])
         yield f"tightrope {words[0]}"
 
 
@@ -245,7 +245,7 @@ def registry(words: list[str]) -> dict[str, Any]:
         counts[f"{package}: {'told' if told else 'without a message'}"] += 1
         if told:
             found[env_id] = "; ".join(told)
-            print(env_id, found[env_id], flush=True)
+        print(env_id, found.get(env_id, ""), file=sys.stderr, flush=True)
     return {"counts": dict(counts), "told": found}
 
 
@@ -258,12 +258,12 @@ def apart(python: str, words: list[str]) -> dict[str, Any]:
     environment = {**os.environ, "SDL_VIDEODRIVER": "dummy", "OMP_NUM_THREADS": "1", "PYTHONPATH": source}
     command = [python, str(Path(__file__).resolve()), *words, "--here"]
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=LIMIT)
-        return json.loads(done.stdout.splitlines()[-1])
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=LIMIT)
+        return json.loads(ended.stdout.splitlines()[-1])
     except subprocess.TimeoutExpired:
         return {"right": False, "error": f"not back after {LIMIT} s"}
     except (IndexError, json.JSONDecodeError):
-        return {"right": False, "error": f"code {done.returncode}: {done.stderr.strip()[-600:]}"}
+        return {"right": False, "error": f"code {ended.returncode}: {ended.stderr.strip()[-600:]}"}
 
 
 def main() -> int:
