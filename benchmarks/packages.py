@@ -170,7 +170,8 @@ def on_the_command_line(task: Package, folder: Path) -> Iterator[str]:
             [sys.executable, "-m", "tightrope", *words, *module], capture_output=True, text=True
         )
         if ended.returncode:
-            raise RuntimeError(f"tightrope {words[0]}: code {ended.returncode}: {ended.stderr.strip()[-600:]}")
+            said = ended.stderr.strip()[-600:]
+            raise RuntimeError(f"tightrope {words[0]}: code {ended.returncode}: {said}")
         json.loads(ended.stdout.splitlines()[-1])
         yield f"tightrope {words[0]}"
 
@@ -220,7 +221,7 @@ def registry(words: list[str]) -> dict[str, Any]:
         gym.register_envs(importlib.import_module(module))
     for env_id, spec in list(gym.registry.items()):
         package = str(spec.entry_point).partition(":")[0].partition(".")[0]
-        if package not in REGISTRIES or (words and not any(word in env_id for word in words)):
+        if package not in REGISTRIES or (words and not any(word in (package, env_id) for word in words)):
             continue
         try:
             with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
@@ -273,7 +274,9 @@ def main() -> int:
         "--python", default=sys.executable, metavar="FILE", help="interpreter with the packages"
     )
     parser.add_argument("--tasks", default=",".join(PACKAGES), metavar="A,B", help="which, of the table")
-    parser.add_argument("--registry", nargs="*", metavar="WORD", help="every id, or some")
+    parser.add_argument(
+        "--registry", nargs="*", metavar="WORD", help="every id, or those of packages, or some ids"
+    )
     parser.add_argument("--needs", action="store_true", help="print the packages")
     parser.add_argument("--here", action="store_true", help="in this interpreter, only print the JSON")
     parser.add_argument("--out", type=Path, default=RESULTS)
