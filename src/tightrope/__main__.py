@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import os
 import signal
 import sys
+from typing import NoReturn
 
 SECONDS_TO_END = 5.0  # for what user code has left running
 
@@ -14,6 +17,9 @@ def run() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         # which would print a traceback while modules are imported
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(128 + number))
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # no stream, or one without a file
+        faulthandler.enable()  # a crash in native code of an environment says where
+    _tell_of_exits()
     from tightrope.cli.main import main
 
     code = 1
@@ -22,6 +28,28 @@ def run() -> None:
     finally:
         _leave_behind(code)
     sys.exit(code)
+
+
+def _tell_of_exits() -> None:
+    """``os._exit`` in an environment or a reward function would end the process without a word, and with the
+    code 0 for half a run.
+    """
+    ends, process = os._exit, os.getpid()
+
+    def end(status: int) -> NoReturn:
+        caller = str(sys._getframe(1).f_globals.get("__name__"))
+        if os.getpid() == process and caller.partition(".")[0] not in ("tightrope", "__main__"):
+            print(
+                f"tightrope: os._exit({status}) was called in {caller}: the process ends and the run is not "
+                "finished. A run folder can be resumed; --vector-backend workers keeps environments out of "
+                "this process.",
+                file=sys.stderr,
+                flush=True,
+            )
+            status = status or 1
+        ends(status)
+
+    os._exit = end
 
 
 def _leave_behind(code: int) -> None:

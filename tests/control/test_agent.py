@@ -143,6 +143,37 @@ def test_warm_start_refuses_other_spaces():
         make().set_env("Acrobot-v1")
 
 
+class Reach(gym.Env):
+    """A Box to see and one to act in, with these bounds."""
+
+    def __init__(self, seen, acted):
+        self.observation_space = gym.spaces.Box(-seen, seen, (2,), np.float32)
+        self.action_space = gym.spaces.Box(-acted, acted, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, True, False, {}
+
+
+def test_other_bounds_of_actions_are_other_actions(tmp_path):
+    """They are mapped; no network sees those of observations."""
+    agent = make(lambda: Reach(1, 1))
+    agent.save(tmp_path / "x")
+    for seen, acted, fits in ((500, 1, True), (1, 200, False)):
+        env = lambda seen=seen, acted=acted: Reach(seen, acted)  # noqa: E731
+        if fits:
+            agent.set_env(env)
+            tightrope.load(tmp_path / "x", env=env)
+            continue
+        with pytest.raises(ValueError, match="this policy was made for"):
+            agent.set_env(env)
+        with pytest.raises(ValueError, match="trained on action bounds"):
+            tightrope.load(tmp_path / "x", env=env)
+
+
 class Own(nn.Module):
     def __init__(self, observation_space, action_space):
         super().__init__()

@@ -123,9 +123,48 @@ def test_ties_at_a_tiny_clip_are_no_difference_of_the_engines(tiny: dict[str, fl
 
 @pytest.mark.parametrize("steps", [1, 0, -5])
 def test_a_budget_of_less_than_a_step_in_each_environment(agent: tightrope.PPO, steps: int) -> None:
-    with pytest.raises(ValueError, match=f"{steps} steps are less than two, .* in each of 2 environments"):
+    with pytest.raises(
+        ValueError, match=f"{steps} steps are too few: there are 2 .*at least 4|total_steps is {steps}"
+    ):
         agent.learn(steps)
     assert agent.steps == 0
+
+
+@pytest.mark.parametrize(
+    ("steps", "words"),
+    [
+        (np.nan, "total_steps is nan"), ("x", "total_steps is 'x'"), (2.5, "total_steps is 2.5"),
+        (True, "total_steps is True"), (10**400, "a number of more than 30 digits"),
+    ],
+)  # fmt: skip
+def test_a_budget_that_is_no_whole_number(agent: tightrope.PPO, steps: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        agent.learn(steps)
+    assert agent.steps == 0
+
+
+def test_a_budget_may_be_written_as_a_float() -> None:
+    assert 64 < tightrope.PPO("CartPole-v1", **SMALL).learn(1e2).steps <= 100
+
+
+def test_a_budget_that_is_too_small_leaves_no_run_folder(tmp_path: Path) -> None:
+    agent = tightrope.PPO("CartPole-v1", total_steps=3, **SMALL)
+    with pytest.raises(ValueError, match="3 steps are too few"):
+        train(agent.settings, run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_empty_batch_has_no_actions(agent: tightrope.PPO) -> None:
+    assert agent.predict(np.zeros((0, 4), np.float32))[0].shape == (0,)
+    assert agent.value(np.zeros((0, 4), np.float32)).shape == (0,)
+
+
+@pytest.mark.parametrize("name", ["7.foo", "x.foo", "0", "-1.foo", "0.a b"])
+def test_what_is_carried_is_an_attribute_of_a_layer(name: str) -> None:
+    for backend, words in (("serial", "there are 3 here"), ("vector", "vector environments have none")):
+        given = {**SMALL, "vector_backend": backend, "carried": name}
+        with pytest.raises(ValueError, match=f"carried has .*; expected LAYER.ATTRIBUTE.*{words}"):
+            tightrope.PPO("CartPole-v1", **given)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -213,17 +252,62 @@ def test_what_numpy_would_store_as_another_number(odd: dict[str, Any], words: st
         agent.learn(64)
 
 
-def test_a_flag_that_is_neither_true_nor_false() -> None:
-    class Two(Odd):
+@pytest.mark.parametrize("late", [0, 20])
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (1, "1", "the reward is '1', expected one number"), (1, None, "the reward is None"),
+        (1, np.array([1.0]), r"the reward is array\(\[1"), (1, 1 + 2j, r"the reward is \(1\+2j\)"),
+        (2, 2, "terminated is 2, expected True or False"), (2, "False", "terminated is 'False'"),
+        (2, np.nan, "terminated is nan"), (2, np.array([False]), "terminated is array"),
+        (3, None, "truncated is None"), (4, None, "info is a NoneType, expected a dict"),
+    ],
+)  # fmt: skip
+def test_what_a_step_returns_is_checked_at_every_step(late: int, place: int, value: Any, words: str) -> None:
+    class Late(Odd):
         def step(self, action: Any) -> Any:
-            return np.zeros(2, np.float32), 0.0, 2, False, {}
+            self.t += 1
+            found: list[Any] = [np.zeros(2, np.float32), 0.0, False, False, {}]
+            if self.t > late:
+                found[place] = value
+            return tuple(found)
 
-    with pytest.raises(EnvironmentFault, match="terminated is 2, expected True or False"):
-        tightrope.PPO(Two, **SMALL).learn(64)
+    with pytest.raises(EnvironmentFault, match=f"at step {late + 1} does not follow.*{words}"):
+        tightrope.PPO(Late, **SMALL).learn(64)
+
+
+@pytest.mark.parametrize("kind", [bool, np.bool_, int, float, np.int8])
+def test_flags_may_be_any_kind_of_0_and_1(kind: Any) -> None:
+    class Short(Odd):
+        def step(self, action: Any) -> Any:
+            self.t += 1
+            return np.zeros(2, np.float32), np.float32(1), kind(self.t % 4 == 0), kind(0), {}
+
+    agent = tightrope.PPO(Short, **SMALL)
+    assert sum(len(update.episodes) for update in agent.iterate(64)) == 16
+
+
+@pytest.mark.parametrize(
+    ("place", "value"), [(1, ["1", "2"]), (2, [2, 0]), (2, ["False", "x"]), (3, [None, None]), (1, [1j, 0])]
+)
+def test_what_a_vector_step_returns_is_checked_at_every_step(place: int, value: Any) -> None:
+    class Late(gym.vector.SyncVectorEnv):
+        count = 0
+
+        def step(self, actions: Any) -> Any:
+            self.count += 1
+            found = list(super().step(actions))
+            if self.count > 5:
+                found[place] = np.array(value)
+            return tuple(found)
+
+    vector = Late([lambda: Odd(ended=False)] * 2)
+    with pytest.raises(EnvironmentFault, match="expected numbers and two arrays of True and False"):
+        tightrope.PPO(vector, **SMALL).learn(64)
 
 
 def test_a_reward_beyond_float32() -> None:
-    with pytest.raises(BadNumbers, match=r"reward = 1e\+300 at step 3 .*at most 3.4e\+38"):
+    with pytest.raises(BadNumbers, match=r"reward = 1e\+300 at step 4 .*at most 3.4e\+38"):
         tightrope.PPO(lambda: Odd(reward=1e300), **SMALL).learn(64)
 
 

@@ -158,6 +158,13 @@ def test_one_that_ends_its_process_at_once_is_named(tmp_path: Path, task: str, h
     assert not (tmp_path / "run").exists()
 
 
+def test_one_that_ends_the_run_later_is_told(tmp_path: Path) -> None:
+    """In this process nothing can keep it alive; the code is not that of a finished run."""
+    ended = train(tmp_path, "EndsLate", "--vector-backend", "serial", "--json")
+    assert ended.returncode == 1 and not ended.stdout
+    assert "os._exit(0) was called in tasks: the process ends and the run is not finished" in ended.stderr
+
+
 def test_workers_hold_every_copy(tmp_path: Path) -> None:
     """Those that train, and those that evaluate."""
     ended = train(tmp_path, "EndsLate", "--vector-backend", "workers", "--evaluate-every", "none")

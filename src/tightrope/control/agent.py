@@ -34,13 +34,13 @@ from tightrope.control.environments.processes import available_cores
 from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.policy.policy import Policy
-from tightrope.control.resolve import anywhere, require_room, resolve, resolved
+from tightrope.control.resolve import anywhere, require_room, resolve, resolved, without_effect
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.episodes import FinishedEpisodes
 from tightrope.control.rollout.rollout import Rollout, cut_shares, to_batch
 from tightrope.control.rollout.running import Before, begin
 from tightrope.control.settings import TrainSettings
-from tightrope.control.spaces.structure import Array, Inputs, Reading, structure
+from tightrope.control.spaces.structure import Array, Inputs, Reading, bounds_of, structure
 from tightrope.maths.values import explained_variance
 from tightrope.runs import checkpoint, generators, signals
 from tightrope.runs.growing import GROUP as ACTIONS
@@ -49,6 +49,7 @@ from tightrope.training.memory import DoesNotFit
 from tightrope.training.parameters import Tensors, whole_update
 
 WARM_UP_STEPS = 512  # for the first statistics of observations: the initial policy acts, nothing is learnt
+USUAL = 1_000  # steps of an episode that is not unusually long, where the task has no time limit
 MIN_COLUMNS = 16  # ten epochs on fewer steps than this would only add noise to a finished policy
 
 
@@ -106,18 +107,8 @@ class Agent:
         self._update_seconds: float | None = None  # of the newest update
         self.settings = resolved(present, self.environments, self.engine.name, threads)
         if settings is None:
-            for text in self.without_effect(present):
+            for text in without_effect(present, self.environments.action_layout):
                 notify(text)
-
-    def without_effect(self, settings: TrainSettings) -> list[str]:
-        """Which settings were changed and do nothing here."""
-        found, box = settings.without_effect(), bool(self.environments.action_layout.gaussian.any())
-        usual = {"std": "independent", "action_bounds": "map"}
-        return found + [
-            f"{name} has no effect: the task has no Box action."
-            for name, value in usual.items()
-            if not box and getattr(settings, name) != value
-        ]
 
     def _require_room(self, settings: TrainSettings, policy: Any) -> None:
         environments = self.environments
@@ -144,15 +135,13 @@ class Agent:
         ``start``: the agent step at which this budget began (default: now). Ctrl-C drops a rollout at once
         and lets an update finish, or undoes a long one; the agent is then as it was between two updates.
         """
-        budget = self.settings.total_steps if total_steps is None else total_steps
+        if isinstance(total_steps, float) and total_steps.is_integer():
+            total_steps = int(total_steps)  # learn(1e6)
+        given = {} if total_steps is None else {"total_steps": total_steps}
+        budget = self.settings.with_values(**given).total_steps
         start = self.steps if start is None else start
-        rows, ready = self.environments.num_envs, self.normalisers.ready
-        if start == self.steps and budget < (rows if ready else 2 * rows):
-            least = "one" if ready else "two, of which the first only gives statistics of observations,"
-            raise ValueError(
-                f"{budget} steps are less than {least} in each of {rows} environments; expected at least "
-                "that many. Give more steps, or fewer num_envs."
-            )
+        if start == self.steps:
+            self.require_enough(budget)
         for note in [] if self.steps else self.environments.action_layout.not_mapped():
             self.notify(note)
         if not self.begun:
@@ -167,7 +156,21 @@ class Agent:
                 after = self.steps - start
                 on_grid = crosses(before, after, budget, self.settings.checkpoint_every)
                 self.failed = rollout.failed
+            usual, longest = self.environments.max_episode_steps or USUAL, self.collector.longest()
+            if line := self.episodes.silence(self.steps, bool(rollout.episodes), budget, longest, usual):
+                self.notify(line)
             yield Update(after, budget, metrics, before, on_grid, rollout.episodes, seeds=rollout.seeds)
+
+    def require_enough(self, budget: int) -> None:
+        """ValueError where a budget of agent steps is too small to learn from."""
+        rows, ready = self.environments.num_envs, self.normalisers.ready
+        least = rows if ready else 2 * rows
+        if budget < least:
+            why = "" if ready else ", and the first step of each only gives statistics of observations"
+            raise ValueError(
+                f"{budget} steps are too few: there are {rows} environments{why}. Expected at least {least}: "
+                "give more steps, or fewer num_envs."
+            )
 
     @contextlib.contextmanager
     def _whole_updates(self) -> Iterator[None]:
@@ -321,7 +324,8 @@ class Agent:
     # ------------------------------------------------------------------------------------- moving and saving
 
     def set_env(self, env: Any) -> Agent:
-        """Continue on another environment with the same spaces (a warm start).
+        """Continue on another environment with the same spaces (a warm start); bounds of observations, which
+        no network sees, may be others.
 
         Raises ValueError, with nothing changed, when the spaces differ.
         """
@@ -329,11 +333,11 @@ class Agent:
         free = anywhere(self.settings, env, num_envs=rows)
         fresh, old = _environments(env, free), self.environments
         for name in ("observation_layout", "action_layout"):
-            seen, expected = getattr(fresh, name).space, getattr(old, name).space
-            if seen != expected:
+            seen, expected = getattr(fresh, name).space, getattr(old, name)
+            if not expected.fits(seen):
                 fresh.close()
                 raise ValueError(
-                    f"The new environment has {name[:-7]}s {seen}; this policy was made for {expected}."
+                    f"The new environment has {name[:-7]}s {seen}; this policy was made for {expected.space}."
                 )
         old.close()
         self.env, self.environments = env, fresh
@@ -387,13 +391,14 @@ class Agent:
         return {
             "observations": structure(environments.observation_layout.space),
             "actions": structure(environments.action_layout.space),
+            "action bounds": bounds_of(environments.action_layout.space),
         }
 
     def require_spaces(self, state: dict[str, Any]) -> None:
         """ValueError when a saved policy was trained on other observations or actions than there are here."""
         saved = state.get("spaces")  # missing in old runs
         for name, here in self._spaces().items():
-            if isinstance(saved, dict) and saved.get(name) != here:
+            if isinstance(saved, dict) and saved.get(name, here) != here:
                 raise ValueError(
                     f"The saved policy was trained on {name} {saved.get(name)}; this environment has {here}. "
                     "Give an environment with the same spaces."

@@ -159,3 +159,14 @@ def resolved(
         engine=engine,
         threads=threads,
     )
+
+
+def without_effect(settings: TrainSettings, actions: ActionLayout) -> list[str]:
+    """Which settings were changed and do nothing for these actions."""
+    found, box = settings.without_effect(), bool(actions.gaussian.any())
+    usual = {"std": "independent", "action_bounds": "map"}
+    return found + [
+        f"{name} has no effect: the task has no Box action."
+        for name, value in usual.items()
+        if not box and getattr(settings, name) != value
+    ]

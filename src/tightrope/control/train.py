@@ -12,7 +12,7 @@ from tightrope.control.agent import AGENTS, Agent
 from tightrope.control.environments.faults import EnvironmentFault, FailedEpisode
 from tightrope.control.environments.make import Environments
 from tightrope.control.repetition import Repetition
-from tightrope.control.resolve import resolve
+from tightrope.control.resolve import resolve, without_effect
 from tightrope.control.rollout.collector import BadNumbers
 from tightrope.control.rollout.evaluation import (
     cut_text,
@@ -29,6 +29,7 @@ from tightrope.runs.folders import require_kind
 from tightrope.runs.records import write_json
 from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
+from tightrope.runs.versions import known
 from tightrope.training import loop
 from tightrope.training.events import Listener, Listeners
 from tightrope.training.learner import Update, crosses
@@ -37,8 +38,6 @@ from tightrope.training.parameters import Tensors
 from tightrope.training.tensorboard import require_tensorboard
 
 __all__ = ["resolve", "resume", "train"]
-
-USUAL = 1_000  # steps of an episode that is not unusually long, where the task has no time limit
 
 
 @signals.stoppable()
@@ -57,18 +56,20 @@ def train(
     require_tensorboard(settings.tensorboard)
     source = settings.env if env is None else env
     agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=report.info)
-    for text in agent.without_effect(settings):
+    for text in without_effect(settings, agent.environments.action_layout):
         report.warn(text)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
-    with contextlib.closing(agent), Run.create(run_dir, settings.to_json(), name, home) as run:
-        learner = AgentLearner(agent, run, report)
-        if agent.policy.own is not None or not isinstance(source, str):
-            # settings.json is not enough to make these first weights again
-            tensors, state = learner.snapshot()
-            run.save(0, tensors, state, keep=settings.keep_checkpoints, warn=report.warn)
-        with contextlib.closing(learner):
-            return loop.train(learner, run, report)
+    with contextlib.closing(agent):
+        agent.require_enough(settings.total_steps)  # before there is a folder of a run that cannot begin
+        with Run.create(run_dir, settings.to_json(), name, home) as run:
+            learner = AgentLearner(agent, run, report)
+            if agent.policy.own is not None or not isinstance(source, str):
+                # settings.json is not enough to make these first weights again
+                tensors, state = learner.snapshot()
+                run.save(0, tensors, state, keep=settings.keep_checkpoints, warn=report.warn)
+            with contextlib.closing(learner):
+                return loop.train(learner, run, report)
 
 
 @signals.stoppable()
@@ -102,9 +103,10 @@ def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, p
     if "reseed_after" not in saved:
         versions = {} if point is None else read_manifest(present(point.folder))["versions"]
         raise ValueError(
-            f"{run_dir} was written by an earlier tightrope ({versions.get('tightrope', 'unknown')}), "
-            "whose checkpoints do not hold what an exact resume needs now: resume it with that version, or "
-            f"learn on from its policy in Python, tightrope.load({str(run_dir)!r}).learn(n)."
+            f"{run_dir} was written by tightrope {versions.get('tightrope', 'of an unknown version')}; its "
+            f"checkpoints do not hold what an exact resume by this version, {known()['tightrope']}, needs: "
+            "resume it with that version, or learn on from its policy in Python, "
+            f"tightrope.load({str(run_dir)!r}{', env=...' if own_environment else ''}).learn(n)."
         )
     if env is None and own_environment:
         raise ValueError(name_again(run_dir, settings.env, "resume"))
@@ -154,7 +156,6 @@ class AgentLearner:
         self.final: dict[str, float] = {}
         self._told_of_long_episodes = False
         self._repetition = Repetition(agent, run, listeners)
-        self._heard: int | None = 0  # when an episode last finished; None: it was told that none does
         self.merit = None  # the newest checkpoints are kept; the best policy has its own folder
         self._environments: Environments | None = None
         self._told_of_cuts = False
@@ -217,7 +218,6 @@ class AgentLearner:
             for update in self.agent.iterate(self.total, start=0):
                 for episode in self.agent.failed:
                     self.listeners.info(f"Environment {episode.copy} was restarted. {self._kept(episode)}")
-                self._tell_of_silence(update)
                 self._repetition.after_update()
                 yield update
         except (EnvironmentFault, BadNumbers) as error:
@@ -234,21 +234,6 @@ class AgentLearner:
         return (
             f"{path} holds the seed and the actions of the episode; docs/faults.md repeats it in three lines."
         )
-
-    def _tell_of_silence(self, update: Update) -> None:
-        """Once: that no episode has finished for a quarter of the run, and not because they are just long."""
-        if update.episodes and self._heard is not None:
-            self._heard = update.step
-        longest = int(self.agent.collector.boundary().lengths.max())
-        usual = self.agent.environments.max_episode_steps or USUAL
-        if self._heard is not None and update.step - self._heard > self.total / 4 and longest > usual:
-            since = f"since step {self._heard:,}" if self._heard else "so far"
-            self._heard = None
-            self.listeners.info(
-                f"No episode has finished {since}, at step {update.step:,}; the longest has run for "
-                f"{longest:,} steps. Returns are counted when an episode ends. If episodes should end, look "
-                "at when the task terminates, or give it a time limit (gymnasium.wrappers.TimeLimit)."
-            )
 
     def evaluate(self, update: Update | None) -> dict[str, float]:
         """The evaluation at points of its grid; the one at the end is `conclude`'s."""

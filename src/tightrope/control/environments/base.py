@@ -29,6 +29,7 @@ class Environments(ABC):
     num_workers: int = 1
     reseed_after: int | None = None  # see Seeding
     carried_names: Sequence[str] = ()
+    layers: int = 0  # of a single environment: its wrappers and itself
     makers: Sequence[Any] = ()  # of single environments: one function a copy
     reading: Reading
     replays: bool = False  # single environments, whose episodes repeat from seed and actions

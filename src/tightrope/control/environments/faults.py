@@ -9,6 +9,7 @@ environments.
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 import traceback
 from collections.abc import Callable
@@ -238,7 +239,7 @@ def kind_of(value: Any) -> str:
 
 def float_parts(inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
     """The inputs that can hold a NaN, each with its rows' numbers in one axis: [N, K]."""
-    return [x.reshape(len(x), -1) for x in inputs.values() if x.dtype.kind == "f"]
+    return [x.reshape(len(x), math.prod(x.shape[1:])) for x in inputs.values() if x.dtype.kind == "f"]
 
 
 def first_unusable(numbers: Any) -> tuple[int, ...] | None:
@@ -256,7 +257,8 @@ def require_finite(inputs: dict[str, Any]) -> dict[str, Any]:
         if found is not None:
             row, index = found
             raise ValueError(
-                f"observation {row} holds {numbers[row, index]} at index {index}; expected finite numbers."
+                f"observation {row} holds {numbers[row, index]} at index {index}; expected finite numbers of "
+                f"at most {FLOAT32_MAX:.2g}."
             )
     return inputs
 

@@ -38,6 +38,10 @@ from tightrope.control.spaces.observations import ObservationLayout, observation
 from tightrope.control.spaces.structure import MASK_KEY, Inputs, Reading
 from tightrope.runs import generators
 
+# types of flags and rewards that need no look at each step
+FLAGS = frozenset((bool, np.bool_))
+NUMBERS = frozenset((float, int, np.float64, np.float32))
+
 
 @dataclass(frozen=True, eq=False)
 class StepBuffers:
@@ -267,6 +271,13 @@ class EnvGroup:
                 if not checked:
                     _check_step(result, has_masks)
                 observation, reward, terminated, truncated, info = result
+                if not (
+                    type(terminated) in FLAGS
+                    and type(truncated) in FLAGS
+                    and type(reward) in NUMBERS
+                    and type(info) is dict
+                ):  # numpy would store most of these all the same
+                    _check_step(result, has_masks)
                 rewards[row] = reward
                 if strict:
                     check_finite("reward", rewards[row])
@@ -447,18 +458,18 @@ def _check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
 
 
 def _check_step(result: Any, has_masks: bool) -> None:
-    """Check the first step of an environment. ApiBreak when it does not follow Gymnasium's API."""
+    """Check a step of an environment. ApiBreak when it does not follow Gymnasium's API."""
     if not isinstance(result, tuple) or len(result) != 5:
         raise ApiBreak(
             f"step returned {kind_of(result)}, expected five values: observation, reward, terminated, "
             "truncated, info. Environments of the old gym API (four values) must be ported to Gymnasium 1.x"
         )
     _, reward, terminated, truncated, info = result
-    if isinstance(reward, str | bytes | None) or np.ndim(reward) != 0:
+    if np.ndim(reward) != 0 or np.asarray(reward).dtype.kind not in "biuf":
         several = ". Weigh several rewards into one in a wrapper" if np.ndim(reward) else ""
         raise ApiBreak(f"the reward is {reward!r}, expected one number{several}")
     for name, flag in (("terminated", terminated), ("truncated", truncated)):
-        if not isinstance(flag, bool | np.bool_ | int) or flag not in (True, False):
+        if np.ndim(flag) != 0 or np.asarray(flag).dtype.kind not in "biuf" or flag not in (0, 1):
             raise ApiBreak(f"{name} is {flag!r}, expected True or False")
     if not isinstance(info, dict):
         raise ApiBreak(f"info is {kind_of(info)}, expected a dict")

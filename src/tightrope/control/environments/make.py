@@ -110,8 +110,26 @@ def make_environments(
             )
             environments.spec_id = env if isinstance(env, str) else environments.spec_id
     environments.backend, environments.num_workers = chosen
-    environments.reseed_after, environments.carried_names = reseed_after, (carried or "").split()
+    names = (carried or "").split()
+    try:
+        _require_layers(names, environments.layers)
+    except ValueError:
+        environments.close()
+        raise
+    environments.reseed_after, environments.carried_names = reseed_after, names
     return environments
+
+
+def _require_layers(names: list[str], layers: int) -> None:
+    """ValueError for a name in ``carried`` that is no LAYER.ATTRIBUTE of an environment of so many layers."""
+    for name in names:
+        layer, _, attribute = name.partition(".")
+        if not (layer.isdecimal() and attribute.isidentifier() and int(layer) < layers):
+            here = f"there are {layers} here" if layers else "vector environments have none"
+            raise ValueError(
+                f"carried has {name!r}; expected LAYER.ATTRIBUTE, where layer 0 is the outermost wrapper and "
+                f"{here}. A run finds these names by itself: leave the setting out."
+            )
 
 
 def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> Backend:

@@ -88,7 +88,7 @@ def success_of(info: dict[str, Any]) -> float:
     if value is None:
         return math.nan
     try:
-        return float(value)
+        return float(value.item() if isinstance(value, np.ndarray) else value)
     except (TypeError, ValueError):
         raise ApiBreak(f"info[{SUCCESS_KEY!r}] is {value!r}, expected True or False") from None
 

@@ -59,7 +59,7 @@ from tightrope.control.environments.processes import (
     receive_soon,
     start_context,
 )
-from tightrope.control.environments.state import gives_state
+from tightrope.control.environments.state import gives_state, nested
 from tightrope.control.environments.tasks import close_environment, make_all
 from tightrope.control.environments.watchdog import Watchdog, limited
 from tightrope.control.spaces.actions import action_layout
@@ -145,7 +145,7 @@ class EnvironmentPool(Environments):
             envs[0].observation_space, self.reading.encoder, self.reading.keys
         )
         self.action_layout = action_layout(envs[0].action_space, self.reading.action_bounds)
-        self.gives_own_state = gives_state(envs[0])
+        self.gives_own_state, self.layers = gives_state(envs[0]), len(list(nested(envs[0])))
         check_alike(envs, self.observation_layout, self.action_layout, self.name)
 
     def _allocate(self, *, shared: bool) -> None:

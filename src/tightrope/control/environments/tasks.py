@@ -271,7 +271,13 @@ def _explained(env_id: str, make: Callable[[], Any]) -> Any:
         name = env_id.rpartition(":")[2]
         if name.startswith("ALE/") and importlib.util.find_spec("ale_py") is None:
             raise ValueError(f"{env_id} needs ale-py. Install it: pip install 'tightrope[atari]'.") from error
-        raise ValueError(f"unknown environment id {env_id!r}.{_did_you_mean(name, gym.registry)}") from error
+        near = _did_you_mean(name, gym.registry)
+        more = (
+            ""
+            if near
+            else " If a package of its own brings it, install that, and name it: --env-module NAME."
+        )
+        raise ValueError(f"unknown environment id {env_id!r}.{near}{more}") from error
     except gym.error.Error as error:
         hint = _did_you_mean(env_id, gym.registry)
         raise ValueError(f"environment id {env_id!r} cannot be made: {error}.{hint}") from error

@@ -295,11 +295,17 @@ class VectorEnvironments(Environments):
             rewards.dtype.kind == "f" and terminated.dtype == truncated.dtype == bool
         ):
             return rewards, terminated, truncated > terminated  # "greater" of flags is "and not", in one pass
-        try:
-            rewards = np.array(rewards, np.float64)
-            terminated, truncated = np.array(terminated, bool), np.array(truncated, bool)
-        except (TypeError, ValueError) as error:
-            raise ApiBreak(f"rewards or flags are not arrays of numbers: {error}") from error
+        rewards, terminated, truncated = (np.asarray(x) for x in arrays)
+        if rewards.dtype.kind not in "biuf" or not (_are_flags(terminated) and _are_flags(truncated)):
+            raise ApiBreak(
+                f"rewards are {str(rewards)[:60]}, terminations {str(terminated)[:60]}, truncations "
+                f"{str(truncated)[:60]}; expected numbers and two arrays of True and False"
+            )
+        rewards, terminated, truncated = (
+            rewards.astype(float),
+            terminated.astype(bool),
+            truncated.astype(bool),
+        )
         if not rewards.shape == terminated.shape == truncated.shape == (self.num_envs,):
             raise ApiBreak(
                 f"rewards, terminations and truncations have shapes {rewards.shape}, {terminated.shape} and "
@@ -467,6 +473,10 @@ class VectorEnvironments(Environments):
         env, self._env = self._env, None
         if env is not None and not self._keep:
             close_environment(env, -1, functools.partial(limited, timeout=self.policy.timeout))
+
+
+def _are_flags(array: np.ndarray) -> bool:
+    return array.dtype == bool or (array.dtype.kind in "iuf" and bool(np.isin(array, (0, 1)).all()))
 
 
 def _any(flags: np.ndarray) -> bool:

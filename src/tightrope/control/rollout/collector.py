@@ -76,6 +76,10 @@ class Collector:
         seen = (self._inputs, self._action_mask, self._returns, self._lengths)
         return Boundary(*seen, self._running, self._state)
 
+    def longest(self) -> int:
+        """Steps of the longest running episode."""
+        return int(self._lengths.max())
+
     def resume(self, seed: int, saved: dict[str, Any], logs: dict[str, Array]) -> list[str]:
         """Continue the episodes of a boundary, as `saved` and its logs describe it; what differs from it,
         for people. ValueError for one of other environments.
@@ -290,7 +294,7 @@ class Collector:
         after = first_step + num_steps
         # what, numbers [N, t, k], their rows, the step of the first, the column of the action that led there
         checks = [("observation", x[:, :num_steps], rows, first_step, -1) for x in seen]
-        checks += [("reward", rollout.rewards[:, :num_steps, None], rows, first_step, 0)]
+        checks += [("reward", rollout.rewards[:, :num_steps, None], rows, first_step + 1, 0)]
         checks += [("observation", x[:, None], rows, after, num_steps - 1) for x in float_parts(last)]
         for t, final_rows, final in rollout.finals:
             parts = float_parts(final)

@@ -24,6 +24,24 @@ class FinishedEpisodes:
         self._newest: deque[tuple[float, int]] = deque(maxlen=RECENT)  # return, length
         self._successes: deque[float] = deque(maxlen=RECENT)
         self.longest: float = 0
+        self._heard: int | None = 0  # when an episode last finished; None: it was told that none does
+
+    def silence(self, step: int, ended: bool, budget: int, longest: int, usual: int) -> str | None:
+        """A line, once, where no episode has ended for a quarter of the budget, and not because they are just
+        long. ``ended``: one has since the last call; ``longest``: steps of the longest that runs; ``usual``:
+        of one that is not too long.
+        """
+        if ended and self._heard is not None:
+            self._heard = step
+        if self._heard is None or step - self._heard <= budget / 4 or longest <= usual:
+            return None
+        since = f"since step {self._heard:,}" if self._heard else "so far"
+        self._heard = None
+        return (
+            f"No episode has finished {since}, at step {step:,}; the longest has run for {longest:,} steps. "
+            "Returns are counted when an episode ends. If episodes should end, look at when the task "
+            "terminates, or give it a time limit (gymnasium.wrappers.TimeLimit)."
+        )
 
     def add(self, rollout: Rollout) -> dict[str, float]:
         """Count the episodes of a rollout; the metrics of these and of the last RECENT ones."""

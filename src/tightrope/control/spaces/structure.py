@@ -70,9 +70,9 @@ def selected(space: Space, keys: tuple[str, ...]) -> Space:
     """
     inside = space.spaces if isinstance(space, spaces.Dict) else {}
     if missing := [key for key in keys if key not in inside]:
+        wanted = f"expected some of: {', '.join(inside)}" if inside else "which only a Dict has: leave it out"
         raise ValueError(
-            f"observation_keys has {missing[0]!r}, expected some of: {', '.join(inside)}. The observation "
-            f"space is {space!r}."
+            f"observation_keys has {missing[0]!r}, {wanted}. The observation space is {space!r}."
         )
     if keys:
         return spaces.Dict({key: part for key, part in inside.items() if key in (*keys, MASK_KEY)})
@@ -101,7 +101,7 @@ def place_of(path: Path) -> str:
 def structure(space: Space) -> list[str]:
     """Each basic space inside ``space`` as text: where it lies, its type, its shape or categories.
 
-    Bounds are left out: a policy may move to a task that has others.
+    Bounds are left out: no network sees those of observations, and `bounds_of` gives those of actions.
     """
     found = []
     for path, part in walk(space, "given"):
@@ -136,10 +136,10 @@ def nest(space: Space, parts: Iterator[Any], skip_mask: bool = False) -> Any:
     return next(parts)
 
 
-def bounds_of(space: Space) -> list[Any]:
-    """Low and high of every Box inside ``space``, to compare two spaces."""
+def bounds_of(space: Space) -> list[str]:
+    """Low and high of every Box inside ``space`` as text, to compare two spaces."""
     boxes = [part for _, part in walk(space, "given") if isinstance(part, spaces.Box)]
-    return [(part.low.tolist(), part.high.tolist()) for part in boxes]
+    return [f"{part.low.tolist()} to {part.high.tolist()}" for part in boxes]
 
 
 def useful_bounds(box: spaces.Box) -> np.ndarray:
