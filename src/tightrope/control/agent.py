@@ -37,8 +37,8 @@ from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import anywhere, require_room, resolve, resolved, without_effect
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.episodes import FinishedEpisodes
+from tightrope.control.rollout.replay import Before, begin
 from tightrope.control.rollout.rollout import Rollout, cut_shares, to_batch
-from tightrope.control.rollout.running import Before, begin
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces.structure import Array, Inputs, Reading, bounds_of, structure
 from tightrope.maths.values import explained_variance
@@ -429,7 +429,7 @@ class Agent:
         if not self._fresh:
             return []
         saved, self._saved = self._saved, (None, {})
-        differences = begin(self.collector, saved, self.settings.seed, self.steps)
+        differences = begin(self.collector, saved, self.settings.seed, self.steps, self.notify)
         self._fresh = False
         return differences
 

@@ -68,15 +68,15 @@ def difference_of(environments: Environments, ended: Repeatable) -> str:
     ValueError: why nobody knows.
     """
     seeding, reading, name = environments.seeding, environments.reading, environments.spec_id
-    maker = environments.makers[-1]
+    maker, logs = environments.makers[-1], {f"0.{ended.episode}": np.concatenate(ended.parts)}
 
     def repeat(stack: contextlib.ExitStack) -> list[str]:
         twin = EnvironmentPool([maker], 1, name, policy=FaultPolicy(timeout=None), reading=reading)
         stack.callback(twin.close)
         twin.reseed_after, twin.carried_names = seeding.reseed_after, seeding.carried
-        origins = np.array([[ended.episode, 0, len(ended.log)]])
+        origins = np.array([[ended.episode, 0, ended.steps]])
         saved = Running(origins, np.array([ended.first], np.uint32), [], [ended.carried])
-        return replay(twin, seeding.run, saved, {f"0.{ended.episode}": ended.log}).differences
+        return replay(twin, seeding.run, saved, logs).differences
 
     return "; ".join(in_process_of_its_own(repeat, None))
 
@@ -111,7 +111,7 @@ class Repetition:
         if not self._next or running is None or running.ended is None:
             return
         count = running.ended.episode + 1
-        few = self._steps + len(running.ended.log) <= TESTED_SHARE * self.agent.steps
+        few = self._steps + running.ended.steps <= TESTED_SHARE * self.agent.steps
         if count >= self._next and (few or self._next <= 3):
             self._next = 3 * count
             self._test(running.ended)
@@ -125,7 +125,7 @@ class Repetition:
 
     def _test(self, episode: Repeatable) -> None:
         environments = self.agent.environments
-        self._steps += len(episode.log)
+        self._steps += episode.steps
         try:
             difference = difference_of(environments, episode)
         except ValueError as error:

@@ -76,4 +76,4 @@ class Step(NamedTuple):
     final_inputs: Inputs | None = None  # [F, ...]: the true last observations of these rows
     cut: np.ndarray | None = None  # bool [B]: restarted after a fault; this step did not take place there
     success: np.ndarray | None = None  # float64 [B]: of episodes that ended here; NaN: not said (masks.py)
-    origins: np.ndarray | None = None  # where an episode ended: the first two of `Environments.origins`
+    origins: np.ndarray | None = None  # `Environments.origins`, where an episode ended

@@ -99,8 +99,14 @@ class StepBuffers:
 
         return StepBuffers(**{field.name: mapped(getattr(self, field.name)) for field in fields(self)})
 
-    def step(self, has_masks: bool) -> Step:
-        """The last step, copied."""
+    def origins_at(self, count: int) -> np.ndarray:
+        """See `Environments.origins`; ``count``: of the steps now."""
+        found = self.origins.copy()
+        found[:, 2] = count - found[:, 2]
+        return found
+
+    def step(self, has_masks: bool, count: int) -> Step:
+        """The last step, copied; ``count``: its number."""
         rows = np.flatnonzero(self.truncated) if self.truncated.any() else None
         success = None
         if rows is not None or self.terminated.any():
@@ -116,7 +122,7 @@ class StepBuffers:
             final_rows=rows,
             final_inputs=None if rows is None else {k: array[rows] for k, array in self.final_inputs.items()},
             cut=cut,
-            origins=self.origins.copy() if new else None,
+            origins=self.origins_at(count) if new else None,
             success=success,
         )
 

@@ -193,7 +193,7 @@ class EnvironmentPool(Environments):
         """What the resets that are under way return."""
         self._has_masks = self._await_workers() or (self._group is not None and self._group.has_masks)
         self._under_way = False
-        step = self._buffers.step(self._has_masks)
+        step = self._buffers.step(self._has_masks, self._count)
         return step.inputs, step.action_mask
 
     def renew(self, row: int, wait: int) -> tuple[Inputs, np.ndarray | None]:
@@ -205,7 +205,7 @@ class EnvironmentPool(Environments):
             self._reply(number - 1)
         elif self._group is not None:
             self._group.renew(row, wait)
-        step = self._buffers.step(self._has_masks)
+        step = self._buffers.step(self._has_masks, self._count)
         return step.inputs, step.action_mask
 
     def send(self, rows: slice, actions: np.ndarray) -> None:
@@ -223,13 +223,11 @@ class EnvironmentPool(Environments):
             self._group.step()
         self._await_workers()
         self._under_way = False
-        return self._buffers.step(self._has_masks)
+        return self._buffers.step(self._has_masks, self._count)
 
     def origins(self) -> np.ndarray:
         """See Environments."""
-        found = self._buffers.origins.copy()
-        found[:, 2] = self._count - found[:, 2]
-        return found
+        return self._buffers.origins_at(self._count)
 
     def carried(self) -> list[Any] | None:
         """See Environments."""

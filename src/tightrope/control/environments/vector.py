@@ -202,8 +202,7 @@ class VectorEnvironments(Environments):
             inputs, masks = self._restart(error)
             rewards = np.zeros(self.num_envs)
             no_end = np.zeros(self.num_envs, bool)
-            origins = self._origins.copy() if self.replays else None
-            return Step(inputs, masks, rewards, no_end, no_end.copy(), cut=~no_end, origins=origins)
+            return Step(inputs, masks, rewards, no_end, no_end.copy(), cut=~no_end, origins=self.origins())
         finally:
             self._in_call = False
 
@@ -276,7 +275,7 @@ class VectorEnvironments(Environments):
         self._origins[due, 1:] = (0, self._count)
         self._waiting[begins] = -1
         if ended.any():
-            step = step._replace(origins=self._origins.copy())
+            step = step._replace(origins=self.origins())
         return step._replace(inputs=self._reset_rows(due | begins)) if (due | begins).any() else step
 
     def _reset_rows(self, rows: np.ndarray) -> Inputs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
@@ -25,8 +26,8 @@ from tightrope.control.environments.faults import (
 )
 from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.rollout import replay
+from tightrope.control.rollout.replay import Boundary
 from tightrope.control.rollout.rollout import Rollout
-from tightrope.control.rollout.running import Boundary
 from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.errors import TightropeError
 from tightrope.runs.records import plain
@@ -80,9 +81,11 @@ class Collector:
         """Steps of the longest running episode."""
         return int(self._lengths.max())
 
-    def resume(self, seed: int, saved: dict[str, Any], logs: dict[str, Array]) -> list[str]:
+    def resume(
+        self, seed: int, saved: dict[str, Any], logs: dict[str, Array], tell: Callable[[str], None]
+    ) -> list[str]:
         """Continue the episodes of a boundary, as `saved` and its logs describe it; what differs from it,
-        for people. ValueError for one of other environments.
+        for people. ``tell``: of what takes long. ValueError for one of other environments.
         """
         environments = self.environments
         restarts, copies = environments.restarts, environments.num_envs
@@ -103,7 +106,7 @@ class Collector:
             first_seen = np.array(saved["first"], np.uint32)
             _require_alike("first", first_seen, np.zeros(copies, np.uint32))
             was = replay.Running(origins, first_seen, [], saved["carried"])
-            repeated = replay.replay(environments, seed, was, logs)
+            repeated = replay.replay(environments, seed, was, logs, tell)
             returns[repeated.renewed], lengths[repeated.renewed] = 0.0, 0
             if self.normalisers.rewards is not None:
                 self.normalisers.rewards.running[repeated.renewed] = 0.0
@@ -215,21 +218,9 @@ class Collector:
         """Keep what the running episodes need to continue from here."""
         if self.environments.gives_state:
             self._state = self.environments.get_state()
-        if self._running is None:
-            return
-        observations = {k: x for k, x in rollout.inputs.items() if k.startswith("image")}
-        if rollout.raw.size:
-            observations["flat"] = rollout.raw
-        stepped = replay.Stepped(
-            observations, self._inputs, rollout.inputs.get("action_mask"), self._action_mask,
-            rollout.rewards, rollout.terminated, rollout.truncated, rollout.actions,
-        )  # fmt: skip
-        begun = self._running.origins[0, 0]
-        over = next((t + 1 for t, origins in rollout.origins if origins[0, 0] != begun), 0)
-        if over and not rollout.mask[0, over - 1]:
-            over = 0  # a fault cut it
-        limit = self.replay_limit
-        self._running = replay.continued(self._running, self.environments, stepped, limit, over)
+        if self._running is not None:
+            seen, limit = (self._inputs, self._action_mask), self.replay_limit
+            self._running = replay.recorded(self._running, rollout, *seen, self.environments, limit)
 
     def _cleared(self, num_steps: int) -> Rollout:
         rollout = self._rollout

@@ -1,4 +1,5 @@
-"""Running episodes as seeds and actions: they are repeated to continue a run exactly where it was saved.
+"""The running episodes, as seeds and actions: recorded after each rollout, saved, and repeated to continue a
+run exactly where it was saved.
 
 The log is made from a rollout's arrays after it was collected, never while it is. It holds the actions since
 the last seeded reset of each copy and, for every step, a fingerprint of what the environment answered: hashes
@@ -7,31 +8,44 @@ of the observation, the reward and the action mask, and both flags. A replay com
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
+from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.episode import TRAINING, Start
+from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.spaces.structure import Array, Inputs
+from tightrope.runs.growing import GROUP as ACTIONS
 
 PRINTS = 2  # int32 columns of a fingerprint: the observation; reward, mask and flags
 # odd: a change of a single 64-bit word is always seen in a sum modulo 2**64
 KEYS = np.random.Generator(np.random.PCG64(0x7274)).integers(0, 2**63, 1 << 12, np.uint64) * np.uint64(2)
 KEYS += np.uint64(1)
-NO_MASK = np.zeros(1, np.uint32)
 REWARD, MASK = np.uint32(0xFFFFFF00), np.uint32(0xFC)  # bits of the second column; the last two are the flags
+TELL_AFTER, LONG = 2.0, 10.0  # seconds of a replay: when its length is estimated, and from which it is told
+Groups = dict[str, dict[str, torch.Tensor]]  # tensors by group and name
 
 
-def digests(array: Array) -> Array:
-    """uint64 [N]: a hash of the bytes of each row of an array [N, ...]."""
-    rows = np.ascontiguousarray(array).reshape(len(array), -1).view(np.uint8)
-    if rows.shape[1] % 8:
-        rows = np.pad(rows, ((0, 0), (0, -rows.shape[1] % 8)))
-    words, found = rows.view(np.uint64), np.zeros(len(rows), np.uint64)
-    for first in range(0, words.shape[1], len(KEYS)):  # one block, but for large images
-        block = words[:, first : first + len(KEYS)]
-        found = found * KEYS[-1] + np.einsum("ij,j->i", block, KEYS[: block.shape[1]])
+# ------------------------------------------------------------------------------------------ fingerprints
+
+
+def digests(array: Array, leading: int = 1) -> Array:
+    """uint64: a hash of the bytes behind the leading axes of an array, [N] for [N, ...]."""
+    rows = np.ascontiguousarray(array).reshape(*array.shape[:leading], -1).view(np.uint8)
+    if rows.shape[-1] % 8:
+        rows = np.pad(rows, [(0, 0)] * leading + [(0, -rows.shape[-1] % 8)])
+    words = rows.view(np.uint64)
+    if words.shape[-1] <= len(KEYS):
+        return words @ KEYS[: words.shape[-1]]
+    found = np.zeros(words.shape[:-1], np.uint64)
+    for first in range(0, words.shape[-1], len(KEYS)):  # a large image
+        block = words[..., first : first + len(KEYS)]
+        found = found * KEYS[-1] + block @ KEYS[: block.shape[-1]]
     return found
 
 
@@ -39,38 +53,47 @@ def _folded(hashes: Array) -> Array:
     return (hashes ^ (hashes >> np.uint64(32))).astype(np.uint32)
 
 
-def of_observations(inputs: Inputs) -> Array:
-    """uint32 [N]: fingerprints of N encoded observations."""
-    found = np.uint64(0)
+def of_observations(inputs: Inputs, leading: int = 1) -> Array:
+    """uint32: fingerprints of encoded observations, [N] for N of them."""
+    found = None
     for name in sorted(inputs):
         if inputs[name].size:
-            found = found * KEYS[0] + digests(inputs[name])
-    return _folded(np.asarray(found))
+            here = digests(inputs[name], leading)
+            found = here if found is None else found * KEYS[0] + here
+    return np.uint32(0) if found is None else _folded(found)
 
 
-def of_masks(mask: Array | None) -> Array:
-    """uint32 [N]: fingerprints of action masks [N, L]; one 0 without any."""
-    return NO_MASK if mask is None else _folded(digests(mask)) & MASK
+def of_masks(mask: Array | None, leading: int = 1) -> Array:
+    """uint32: fingerprints of action masks [N, L]; 0 without any."""
+    return np.uint32(0) if mask is None else _folded(digests(mask, leading)) & MASK
 
 
-def of_steps(rewards: Array, terminated: Array, truncated: Array, masks: Array) -> Array:
-    """uint32 [...]: fingerprints of rewards float64, flags and those of the masks."""
+def of_steps(rewards: Array, terminated: Array, truncated: Array) -> Array:
+    """uint32 [...]: fingerprints of rewards float64 and flags."""
     found = np.ascontiguousarray(rewards, np.float64).view(np.uint64) * KEYS[1]
     found >>= np.uint64(32)  # the upper half, on which every bit has an effect
     found &= np.uint64(REWARD)
     found |= terminated.view(np.uint8) << 1 | truncated.view(np.uint8)
-    return (found if masks is NO_MASK else found | masks).astype(np.uint32)
+    return found.astype(np.uint32)
+
+
+# --------------------------------------------------------------------------------------------- recording
 
 
 class Repeatable(NamedTuple):
-    """An episode of copy 0 that is over, or runs: its number, the fingerprint of its first observation, its
-    log and what the copy carried.
+    """An episode of copy 0 that is over, or runs: its number, the fingerprint of its first observation, the
+    parts of its log and what the copy carried.
     """
 
     episode: int
     first: int
-    log: Array
+    parts: list[Array]
     carried: object
+
+    @property
+    def steps(self) -> int:
+        """How long it is."""
+        return sum(map(len, self.parts))
 
 
 class Running(NamedTuple):
@@ -93,9 +116,9 @@ class Running(NamedTuple):
         parts = self.parts[0]
         if parts is None or not (parts or more is not None):
             return None
-        log = np.concatenate(parts if more is None else [*parts, more])
         carried = None if self.carried is None else self.carried[0]
-        return Repeatable(int(self.origins[0, 0]), int(self.first[0]), log, carried)
+        parts = parts if more is None else [*parts, more]
+        return Repeatable(int(self.origins[0, 0]), int(self.first[0]), parts, carried)
 
     def logs(self) -> dict[str, Array]:
         """The whole log of every copy that has one, named after copy and episode."""
@@ -118,54 +141,118 @@ def begun(environments: Environments, inputs: Inputs, mask: Array | None) -> Run
     return Running(origins, first, [[] for _ in range(len(origins))], environments.carried())
 
 
-class Stepped(NamedTuple):
-    """T steps of B copies, as a rollout holds them: observations and masks before each step, and the last."""
-
-    observations: Inputs  # [B, T, ...]
-    last: Inputs  # [B, ...]
-    masks: Array | None  # bool [B, T, L]
-    last_mask: Array | None
-    rewards: Array  # [B, T], as all that follow
-    terminated: Array
-    truncated: Array
-    actions: Array  # float32 [B, T, A], as sampled
-
-
-def continued(
-    running: Running, environments: Environments, stepped: Stepped, limit: int, over: int
+def recorded(
+    running: Running,
+    rollout: Rollout,
+    inputs: Inputs,
+    mask: Array | None,
+    environments: Environments,
+    limit: int,
 ) -> Running:
-    """After T steps: what came before each copy's last seeded reset is forgotten, and a log of more than
-    ``limit`` steps is dropped. ``over``: steps after which copy 0 had its first seeded reset, 0 without any.
+    """After a rollout and the observations and masks behind it: what came before each copy's last seeded
+    reset is forgotten, and a log of more than ``limit`` steps is dropped.
     """
-    origins, shape = environments.origins(), stepped.rewards.shape
-    assert origins is not None
-    num_steps, lengths = shape[1], origins[:, 2]
-    before = of_observations({k: x.reshape(-1, *x.shape[2:]) for k, x in stepped.observations.items()})
-    seen = np.column_stack([before.reshape(shape), of_observations(stepped.last)])
-    masks, present = NO_MASK, seen
-    if stepped.masks is not None:
-        flat = stepped.masks.reshape(-1, stepped.masks.shape[2])
-        masks = np.column_stack([of_masks(flat).reshape(shape), of_masks(stepped.last_mask)])
-        masks, present = masks[:, 1:], seen ^ masks
-    width = stepped.actions.shape[2]
-    rows = np.empty((*shape, width + PRINTS), np.int32)
-    rows[:, :, :width] = stepped.actions.view(np.int32)
-    rows[:, :, width] = seen[:, 1:].view(np.int32)
-    rest = of_steps(stepped.rewards, stepped.terminated, stepped.truncated, masks)
-    rows[:, :, width + 1] = rest.view(np.int32)
-    begins = np.maximum(num_steps - lengths, 0)
-    first = running.first
-    if begins.any():
-        first = np.where(begins > 0, present[np.arange(shape[0]), begins], first)
+    copies, num_steps, width = rollout.actions.shape
+    observed = {name: x for name, x in rollout.inputs.items() if name not in ("flat", "action_mask")}
+    if rollout.raw.size:
+        observed["flat"] = rollout.raw
+    seen = np.empty((copies, num_steps + 1), np.uint32)  # before each step, and behind the last
+    seen[:, :-1], seen[:, -1] = of_observations(observed, 2), of_observations(inputs)
+    present, rest = seen, of_steps(rollout.rewards, rollout.terminated, rollout.truncated)
+    if mask is not None:
+        masks = np.column_stack([of_masks(rollout.inputs["action_mask"], 2), of_masks(mask)])
+        present, rest = seen ^ masks, rest | masks[:, 1:]
+    rows = np.empty((copies, num_steps, width + PRINTS), np.int32)
+    rows[:, :, :width] = rollout.actions.view(np.int32)
+    rows[:, :, width], rows[:, :, width + 1] = seen[:, 1:].view(np.int32), rest.view(np.int32)
+
+    origins, carried, ended, first = running.origins + [0, 0, num_steps], running.carried, None, running.first
+    if rollout.origins:
+        last, after = rollout.origins[-1]
+        origins = after + [0, 0, num_steps - 1 - last]
+        carried = None if carried is None else environments.carried()
+        over = next((t for t, x in rollout.origins if x[0, 0] != running.origins[0, 0]), None)
+        if over is not None and rollout.mask[0, over]:  # not cut by a fault
+            ended = running.of_first_copy(rows[0, : over + 1])
+        begins = np.maximum(num_steps - origins[:, 2], 0)
+        first = np.where(begins > 0, present[np.arange(copies), begins], first)
     parts: list[list[Array] | None] = []
-    for row, (old, length, begin) in enumerate(zip(running.parts, lengths, begins, strict=True)):
-        earlier = [] if length < num_steps else old
+    for row, length in enumerate(origins[:, 2].tolist()):
+        earlier = [] if length < num_steps else running.parts[row]
         if earlier is None or length > limit:
             parts.append(None)
         else:
-            parts.append([*earlier, rows[row, begin:].copy()] if begin < num_steps else [])
-    ended = running.of_first_copy(rows[0, :over]) if over else None
-    return Running(origins, first, parts, environments.carried(), ended)
+            parts.append([*earlier, rows[row, -length:]] if length else [])
+    return Running(origins, first, parts, carried, ended)
+
+
+# ------------------------------------------------------------------------------------- saving, continuing
+
+
+class Boundary(NamedTuple):
+    """The running episodes between two rollouts. Collecting the next one changes nothing in it."""
+
+    inputs: Inputs  # the observations from which the next actions are chosen, not normalised
+    action_mask: Array | None
+    returns: Array  # of the running episodes so far
+    lengths: Array
+    running: Running | None  # None: the environments do not replay
+    environments: Any  # the state of a vector environment that gives it, else None
+
+
+def saved_episodes(at: Boundary) -> tuple[dict[str, Any] | None, dict[str, Array]]:
+    """A boundary as JSON, and the logs that grow with it; None where its episodes cannot be continued."""
+    found: dict[str, Any] = {"returns": states.encode(at.returns), "lengths": states.encode(at.lengths)}
+    if at.running is not None:
+        lost = np.array([part is None for part in at.running.parts])
+        origins = np.where(lost[:, None] & [False, False, True], -1, at.running.origins)
+        found |= {"origins": origins.tolist(), "first": at.running.first.tolist()}
+        return {**found, "carried": at.running.carried}, at.running.logs()
+    if at.environments is None:
+        return None, {}
+    seen = {"inputs": at.inputs, "action_mask": at.action_mask, "environments": at.environments}
+    return {**found, **{name: states.encode(value) for name, value in seen.items()}}, {}
+
+
+class Before(NamedTuple):
+    """What an update changes before it is complete, as it was."""
+
+    rng: dict[str, Any]
+    restarts: int
+    boundary: Boundary | None  # None: no episodes are running
+    saved: tuple[Any, Groups]
+
+    def episodes(self) -> tuple[Any, Groups]:
+        """The running episodes as JSON and tensors."""
+        if self.boundary is None:
+            return self.saved
+        episodes, logs = saved_episodes(self.boundary)
+        return episodes, {ACTIONS: {name: torch.from_numpy(x) for name, x in logs.items()}} if logs else {}
+
+
+def begin(
+    collector: Any, saved: tuple[Any, Groups], seed: int, steps: int, tell: Callable[[str], None]
+) -> list[str]:
+    """Continue saved episodes, or begin new ones at an agent step; what is to be told about it. ``tell``: of
+    what takes long.
+    """
+    episodes, logs = saved
+    if not (isinstance(episodes, dict) and "returns" in episodes):  # older versions saved something else
+        collector.reset(seed, steps)  # as number of the episodes: one that is not used yet
+        return []
+    arrays = {name: tensor.numpy() for name, tensor in logs.get(ACTIONS, {}).items()}
+    differences = collector.resume(seed, episodes, arrays, tell)
+    if not differences:
+        return []
+    shown = "; ".join(differences[:3]) + (" ..." if len(differences) > 3 else "")
+    return [
+        f"{len(differences)} of {collector.environments.num_envs} copies did not repeat their episode from "
+        f"its seed and actions, and begin a new one: {shown}. Training goes on, but not with the bits of "
+        "a run without a break."
+    ]
+
+
+# --------------------------------------------------------------------------------------------- repeating
 
 
 class Replayed(NamedTuple):
@@ -180,9 +267,16 @@ class Replayed(NamedTuple):
     differences: list[str]
 
 
-def replay(environments: Environments, seed: int, saved: Running, logs: dict[str, Array]) -> Replayed:
+def replay(
+    environments: Environments,
+    seed: int,
+    saved: Running,
+    logs: dict[str, Array],
+    tell: Callable[[str], None] = lambda text: None,
+) -> Replayed:
     """Repeat running episodes, whose logs are ``logs`` and not in ``saved``. A copy that differs, or has no
-    log (-1 steps), begins a new one. ValueError for a log that does not fit.
+    log (-1 steps), begins a new one. ``tell``: what is repeated, if it takes long. ValueError for a log that
+    does not fit.
     """
     origins, width = saved.origins, environments.action_layout.num_columns
     lost, lengths = origins[:, 2] < 0, np.maximum(origins[:, 2], 0)
@@ -201,6 +295,7 @@ def replay(environments: Environments, seed: int, saved: Running, logs: dict[str
     same, differences = ~lost, list[str]()
     seen = np.stack([of_observations(inputs) ^ of_masks(mask), np.zeros(copies, np.uint32)], axis=1)
     wanted = np.stack([saved.first, seen[:, 1]], axis=1)
+    clock, told = time.monotonic(), False
     for t in range(longest + 1):
         for row in np.flatnonzero(same & (seen != wanted).any(axis=1)).tolist():
             same[row] = False
@@ -212,9 +307,16 @@ def replay(environments: Environments, seed: int, saved: Running, logs: dict[str
             break
         step = environments.step(script[:, t, :width].view(np.float32))
         inputs, mask = step.inputs, step.action_mask
-        rest = of_steps(step.rewards, step.terminated, step.truncated, of_masks(mask))
+        rest = of_steps(step.rewards, step.terminated, step.truncated) | of_masks(mask)
         seen, wanted = np.column_stack([of_observations(inputs), rest]), script[:, t, width:].view(np.uint32)
         wanted = np.where((t >= waits)[:, None], wanted, seen)
+        if not told and (spent := time.monotonic() - clock) > TELL_AFTER:
+            told, left = True, spent / (t + 1) * (longest - t - 1)
+            if left > LONG:
+                tell(
+                    f"The running episodes are repeated, {longest:,} steps in {copies} copies: about "
+                    f"{left:,.0f} s more. A signal leaves at once, and loses nothing."
+                )
     running = begun(environments, inputs, mask)
     assert running is not None
     parts: list[list[Array] | None] = [
