@@ -18,8 +18,8 @@ from typing import Any
 from tightrope.runs.durable import BLOCK, replace_file, spare_standard_streams, write_all, writing
 
 SIGNATURE = "sha256"  # in settings.json: of the settings in it, so that a resume notices any change
-# The files of a run that grow. changes.jsonl: settings that a listener has changed; actions.jsonl: growing.
-RECORDS = ("metrics.jsonl", "episodes.jsonl", "samples.jsonl", "changes.jsonl", "actions.jsonl")
+# The files of a run that grow. changes.jsonl: settings that a listener has changed.
+RECORDS = ("metrics.jsonl", "episodes.jsonl", "samples.jsonl", "changes.jsonl")
 
 
 def plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import re
 import time
@@ -48,7 +49,8 @@ class Run:
         self._files: dict[str, Recorder] = {}
         self._lock: WriterLock | None = None
         self._costs: dict[str, float] = {}
-        self._held: dict[str, int] | None = None  # rows of tensors that grow, see growing.py; None: not read
+        self._held: dict[str, int] = {}  # rows of tensors that grow, see growing.py, in their file
+        self._large = growing.SMALL  # the size at which that file is made smaller
         self._new_name = False  # a record file was created and its name is not yet durable
 
     @classmethod
@@ -130,18 +132,18 @@ class Run:
 
     def newest(self) -> Checkpoint:
         """Read the newest valid checkpoint, without the lock. Damaged ones are skipped with a
-        warning. Raises CheckpointError.
+        warning. Raises CheckpointError. Where the file of tensors that grow is damaged, it has none.
         """
-        return self._with_growing(retention.valid(self.checkpoints))
+        point = retention.valid(self.checkpoints)
+        with contextlib.suppress(CheckpointError):
+            self._add_growing(point)
+        return point
 
-    def _with_growing(self, point: Checkpoint) -> Checkpoint:
-        """With the tensors that grow; a checkpoint of an older version, or without any, as it is."""
-        wanted = point.state.get("growing")
-        if not wanted:
-            return point
-        with checkpoint.understood(point.folder):
-            tensors = growing.gathered(read_lines(self.path / growing.FILE), wanted)
-        return point._replace(tensors={**point.tensors, growing.GROUP: tensors})
+    def _add_growing(self, point: Checkpoint) -> None:
+        """Read the tensors that grow; a checkpoint of an older version, or without any, stays as it is."""
+        if wanted := point.state.get("growing"):
+            with checkpoint.understood(point.folder):
+                point.tensors[growing.GROUP] = growing.gathered(self.path / growing.FILE, wanted)
 
     def record(self, step: int, seconds: float, values: dict[str, float]) -> dict[str, float]:
         """Append the metrics of one update, and the cost of the checkpoint before it; returns both. Every
@@ -242,20 +244,34 @@ class Run:
             return False
         try:
             retention.prune(self.checkpoints, keep)
+            self._drop_rows()
         except OSError as error:
-            warn(f"An old checkpoint cannot be deleted: {error}. Check {self.checkpoints}.")
+            warn(f"What is no longer needed cannot be deleted: {error}. Check {self.checkpoints}.")
         size = sum(path.stat().st_size for path in folder.iterdir())
         seconds = time.perf_counter() - clock
         self._costs = {"time/checkpoint_seconds": seconds, "time/checkpoint_megabytes": size / 1e6}
         return True
 
-    def _grow(self, tensors: dict[str, Tensor]) -> dict[str, int]:
-        """Append what is new of the tensors that grow; returns their lengths."""
-        if self._held is None:
-            self._held = growing.held_in(read_lines(self.path / growing.FILE))
+    def _grow(self, tensors: dict[str, Tensor]) -> dict[str, tuple[int, str]]:
+        """Append what is new of the tensors that grow, durably; returns their marks."""
         self._append(growing.FILE, growing.lines(tensors, self._held))
-        self._held = growing.lengths(tensors)  # of others nothing will be asked again
-        return self._held
+        if growing.FILE in self._files:
+            self._files[growing.FILE].sync()
+        marks = growing.marks(tensors)
+        self._held = {name: length for name, (length, _) in marks.items()}  # others do not come again
+        return marks
+
+    def _drop_rows(self) -> None:
+        """Drop the rows on which no checkpoint counts any more, once their file has doubled."""
+        path = self.path / growing.FILE
+        if growing.FILE not in self._files or path.stat().st_size < self._large:
+            return
+        names = set[str]()
+        for folder in retention.steps_in(self.checkpoints):
+            with contextlib.suppress(CheckpointError):  # damaged: nothing will continue there
+                names |= checkpoint.load_state(folder).get("growing", {}).keys()
+        self._files.pop(growing.FILE).close()
+        self._large = max(growing.SMALL, 2 * growing.drop_others(path, names))
 
     def require_there(self) -> None:
         """CannotWrite when the folder was deleted or renamed: a save would make a part of it again."""
@@ -292,11 +308,11 @@ class Run:
         if self._lock.left_by:
             info(f"the run was left without an end by {self._lock.left_by}")
         self._put_aside_a_damaged_best(warn)
-        point = retention.valid(self.checkpoints, warn, self._check_records)
+        point = retention.valid(self.checkpoints, warn, self._check_files)
         manifest = checkpoint.read_manifest(durable.present(point.folder))
         if changed := versions.version_changes(manifest.get("versions")):
             warn(f"{changed} since the checkpoint: the run continues, but its last bits may differ.")
-        return self._with_growing(point)
+        return point
 
     def _put_aside_a_damaged_best(self, warn: Callable[[str], None]) -> None:
         """Rename it so that it can be saved again: `checkpoint.save` replaces only valid checkpoints."""
@@ -308,13 +324,15 @@ class Run:
             warn(f"The best policy is lost, its folder renamed to unusable-best: {error}")
             durable.put(durable.present(self.best), self.path / "unusable-best")
 
-    def _check_records(self, point: Checkpoint) -> None:
+    def _check_files(self, point: Checkpoint) -> None:
+        """Compare and read what it counts on outside its folder."""
         for name, mark in marks_of(point).items():
             if wrong := disagreement(self.path / name, mark):
                 raise CheckpointError(
                     f"{wrong}. Restore the file. {point.folder} itself is intact: tightrope.load "
                     "and evaluate read it."
                 )
+        self._add_growing(point)
 
     def rewind(self, point: Checkpoint | None) -> None:
         """Prepare to continue from ``point`` (None: from the beginning): remove the rows recorded after it,
@@ -325,7 +343,8 @@ class Run:
         """
         self.lock()
         self._close_files()
-        self._held = None
+        grown = {} if point is None else point.state.get("growing") or {}
+        self._held = {name: length for name, (length, _) in grown.items()}
         with writing(self.path):
             self._clean()
             for folder in retention.steps_in(self.checkpoints):

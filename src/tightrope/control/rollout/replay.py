@@ -26,6 +26,7 @@ PRINTS = 2  # int32 columns of a fingerprint: the observation; reward, mask and 
 # odd: a change of a single 64-bit word is always seen in a sum modulo 2**64
 KEYS = np.random.Generator(np.random.PCG64(0x7274)).integers(0, 2**63, 1 << 12, np.uint64) * np.uint64(2)
 KEYS += np.uint64(1)
+NOTHING = np.zeros(1, np.uint32)
 REWARD, MASK = np.uint32(0xFFFFFF00), np.uint32(0xFC)  # bits of the second column; the last two are the flags
 TELL_AFTER, LONG = 2.0, 10.0  # seconds of a replay: when its length is estimated, and from which it is told
 Groups = dict[str, dict[str, torch.Tensor]]  # tensors by group and name
@@ -60,12 +61,12 @@ def of_observations(inputs: Inputs, leading: int = 1) -> Array:
         if inputs[name].size:
             here = digests(inputs[name], leading)
             found = here if found is None else found * KEYS[0] + here
-    return np.uint32(0) if found is None else _folded(found)
+    return NOTHING if found is None else _folded(found)
 
 
 def of_masks(mask: Array | None, leading: int = 1) -> Array:
     """uint32: fingerprints of action masks [N, L]; 0 without any."""
-    return np.uint32(0) if mask is None else _folded(digests(mask, leading)) & MASK
+    return NOTHING if mask is None else _folded(digests(mask, leading)) & MASK
 
 
 def of_steps(rewards: Array, terminated: Array, truncated: Array) -> Array:
@@ -149,7 +150,7 @@ def recorded(
     environments: Environments,
     limit: int,
 ) -> Running:
-    """After a rollout and the observations and masks behind it: what came before each copy's last seeded
+    """After a rollout, with the observations and masks behind it: what came before each copy's last seeded
     reset is forgotten, and a log of more than ``limit`` steps is dropped.
     """
     copies, num_steps, width = rollout.actions.shape
@@ -166,10 +167,11 @@ def recorded(
     rows[:, :, :width] = rollout.actions.view(np.int32)
     rows[:, :, width], rows[:, :, width + 1] = seen[:, 1:].view(np.int32), rest.view(np.int32)
 
-    origins, carried, ended, first = running.origins + [0, 0, num_steps], running.carried, None, running.first
+    origins, first = running.origins + np.array((0, 0, num_steps)), running.first
+    carried, ended = running.carried, None
     if rollout.origins:
         last, after = rollout.origins[-1]
-        origins = after + [0, 0, num_steps - 1 - last]
+        origins = after + np.array((0, 0, num_steps - 1 - last))
         carried = None if carried is None else environments.carried()
         over = next((t for t, x in rollout.origins if x[0, 0] != running.origins[0, 0]), None)
         if over is not None and rollout.mask[0, over]:  # not cut by a fault
@@ -275,15 +277,18 @@ def replay(
     tell: Callable[[str], None] = lambda text: None,
 ) -> Replayed:
     """Repeat running episodes, whose logs are ``logs`` and not in ``saved``. A copy that differs, or has no
-    log (-1 steps), begins a new one. ``tell``: what is repeated, if it takes long. ValueError for a log that
-    does not fit.
+    log (-1 steps, or it is gone), begins a new one. ``tell``: what is repeated, if it takes long. ValueError
+    for a log that does not fit.
     """
     origins, width = saved.origins, environments.action_layout.num_columns
-    lost, lengths = origins[:, 2] < 0, np.maximum(origins[:, 2], 0)
+    names = [_name(row, episode) for row, episode in enumerate(origins[:, 0].tolist())]
+    missing = np.array([steps > 0 and names[row] not in logs for row, steps in enumerate(origins[:, 2])])
+    lost = missing | (origins[:, 2] < 0)
+    lengths = np.where(lost, 0, origins[:, 2])
     longest, copies = int(lengths.max()), len(lengths)
     script = np.zeros((copies, longest, width + PRINTS), np.int32)  # each copy ends with the last step
     for row, length in enumerate(lengths):
-        log = logs.get(_name(row, origins[row, 0]), script[row, :0])
+        log = script[row, :0] if lost[row] else logs.get(names[row], script[row, :0])
         if log.dtype != script.dtype or log.shape != (length, script.shape[2]):
             raise ValueError(f"the log of copy {row} does not fit its episode")
         script[row, longest - length :] = log
@@ -292,7 +297,10 @@ def replay(
     waits = longest - lengths
     starts = list(map(Start, episodes, waits.tolist(), carried))
     inputs, mask = environments.reset(seed, TRAINING, starts)
-    same, differences = ~lost, list[str]()
+    same = ~lost
+    differences = [
+        f"copy {row}, episode {origins[row, 0]}: its actions are gone" for row in np.flatnonzero(missing)
+    ]
     seen = np.stack([of_observations(inputs) ^ of_masks(mask), np.zeros(copies, np.uint32)], axis=1)
     wanted = np.stack([saved.first, seen[:, 1]], axis=1)
     clock, told = time.monotonic(), False
