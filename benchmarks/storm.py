@@ -5,9 +5,10 @@
     python benchmarks/storm.py --cost
 
 Every kill is a SIGKILL at a random moment drawn from a seed: some milliseconds after the k-th update of a
-process, or inside a save, which a shim in this script slows down. There is no manual step in between. The
-storm records the newest valid checkpoint at each kill. It fails unless the resumed process begins there and
-its first new row is the next one. At the end of the run all its results are compared: SHA-256 of weights,
+process, or inside a save, which a shim in this script slows down. Beside them come SIGTERM and SIGINT, after
+which the process has to end with 143 or 130 and a checkpoint of its newest update. There is no manual step in
+between. The storm records the newest valid checkpoint at each kill. It fails unless the resumed process begins
+there and its first new row is the next one. At the end of the run all its results are compared: SHA-256 of weights,
 optimiser and normalisers, generators and counters, and every row of every .jsonl file, except ``seconds`` and
 ``time/*``. If a run ends before all kills are used, another one follows.
 
@@ -28,6 +29,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -36,7 +38,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 SLOW = 0.03  # extra seconds for every fsync of a save that will be killed; a save has half a dozen
-WAIT = 900.0  # seconds a process may stay silent
+LEAVE = 120.0  # seconds in which a process has to end after a signal
 CLOCKS = ("seconds", "wall_seconds")
 
 
@@ -200,10 +202,15 @@ class Process:
         if status:
             raise RuntimeError(f"a process of the storm failed with status {status}; what it said is above")
 
-    def kill(self) -> None:
-        """Send SIGKILL and wait for the end."""
-        os.kill(self.pid, signal.SIGKILL)
-        os.waitpid(self.pid, 0)
+    def end(self, by: str) -> tuple[list[tuple[str, int]], int]:
+        """Send a signal and wait for the end; what had not been read, and the exit code (-n: by signal n)."""
+        os.kill(self.pid, signal.Signals[by])
+        late = threading.Timer(LEAVE, os.kill, (self.pid, signal.SIGKILL))
+        late.start()
+        unread = [line.split() for line in self._lines]
+        code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        late.cancel()
+        return [(what, int(step)) for what, step in unread], code
 
 
 def _lines(descriptor: int) -> Iterator[str]:
@@ -214,6 +221,7 @@ def _lines(descriptor: int) -> Iterator[str]:
 def _live(story: str, folder: Path, slow: bool, out: int) -> int:
     """The code that a forked process runs."""
     from tightrope.runs import checkpoint
+    from tightrope.runs.signals import Stopped
 
     def tell(what: str, step: int) -> None:
         os.write(out, f"{what} {step}\n".encode())
@@ -238,6 +246,8 @@ def _live(story: str, folder: Path, slow: bool, out: int) -> int:
     try:
         STORIES[story](folder, report)
         return 0
+    except Stopped as stop:
+        return stop.code
     except BaseException:
         traceback.print_exc()
         sys.stderr.flush()
@@ -247,15 +257,16 @@ def _live(story: str, folder: Path, slow: bool, out: int) -> int:
 # ------------------------------------------------------------------------------------- the storm
 
 
-def newest(folder: Path) -> int:
-    """The step of the newest valid checkpoint; 0 if there is none."""
+def newest(folder: Path) -> tuple[int, bool]:
+    """The step of the newest valid checkpoint, 0 if there is none, and whether its row is not recorded yet."""
     from tightrope.runs import checkpoint
     from tightrope.runs.run import Run
 
     try:
-        return checkpoint.step_of(Run.open(folder).newest().folder)
+        point = Run.open(folder).newest()
     except ValueError:
-        return 0
+        return 0, False
+    return checkpoint.step_of(point.folder), bool(point.state.get("pending"))
 
 
 def storm(story: str, kills: int, seed: int, deadline: float, base: Path) -> dict[str, Any]:
@@ -265,62 +276,85 @@ def storm(story: str, kills: int, seed: int, deadline: float, base: Path) -> dic
     list(Process(story, whole, slow=False).events())
     wanted, log, rounds = left(whole), [], 0
     steps = [row["step"] for row in wanted["rows"]["metrics.jsonl"]]
-    while len(log) < kills and time.monotonic() < deadline:
+    while killed_in(log) < kills and time.monotonic() < deadline:
         folder, rounds, ended = base / story / f"run-{rounds}", rounds + 1, False
         while not ended:
-            more = len(log) < kills and time.monotonic() < deadline
+            more = killed_in(log) < kills and time.monotonic() < deadline
             plan = planned(draw) if more else None
-            begin, killed = newest(folder) if folder.exists() else 0, False
+            begin, pending = newest(folder) if folder.exists() else (0, False)
             process = Process(story, folder, slow=bool(plan and plan["inside"]))
             first, killed = follow(process, plan)
-            check_first(story, begin, first, steps)
+            check_first(story, begin, first, [begin] if pending else steps)
             if killed is None:
                 ended = True
                 continue
-            log.append({"kill": len(log) + 1, "run": rounds, **plan, **killed, "newest": newest(folder)})
+            found, _ = newest(folder)
+            if plan["by"] != "SIGKILL":
+                check_left(story, folder, plan, killed, found)
+            log.append({"kill": killed_in(log) + 1, "run": rounds, **plan, **killed, "newest": found})
             print(f"{story}: {json.dumps(log[-1])}", flush=True)
         compare(story, wanted, left(folder))
         shutil.rmtree(folder)
-    inside = sum(entry["inside"] for entry in log)
+    count, inside = killed_in(log), sum(entry["inside"] and entry["by"] == "SIGKILL" for entry in log)
+    others = len(log) - count
     print(
-        f"{story}: {len(log)} kills, {inside} inside a save, {rounds} runs, every one bit-equal", flush=True
+        f"{story}: {count} kills, {inside} inside a save, {others} other signals, {rounds} runs, every one "
+        "bit-equal",
+        flush=True,
     )
-    found = {"kills": len(log), "inside_a_save": inside, "runs": rounds, "all_equal": True}
-    return {**found, "rows": len(steps), "sha256": wanted["sha256"], "log": log}
+    counts = {"kills": count, "inside_a_save": inside, "signals": others, "runs": rounds, "all_equal": True}
+    return {**counts, "rows": len(steps), "sha256": wanted["sha256"], "log": log}
 
 
 def planned(draw: random.Random) -> dict[str, Any]:
     """The next kill: in the k-th save from the start of the process, or after its k-th update."""
-    inside = draw.random() < 0.5
+    inside = draw.random() < 0.65  # some of these saves end before the kill
     after = draw.choice([1, 2, 2, 3]) if inside else draw.choice([0, 1, 2, 3, 5, 7])
     return {
         "inside": inside,
         "after": after,
         "delay": round(draw.uniform(0, 6 * SLOW if inside else 0.05), 4),
+        "by": draw.choice(["SIGKILL", "SIGKILL", "SIGKILL", "SIGTERM", "SIGINT"]),
     }
+
+
+def killed_in(log: list[dict[str, Any]]) -> int:
+    """How many of the entries are kills."""
+    return sum(entry["by"] == "SIGKILL" for entry in log)
 
 
 def follow(process: Process, plan: dict[str, Any] | None) -> tuple[dict[str, int], dict[str, Any] | None]:
     """Watch a process and kill it as planned; returns its first step, its first row and the kill."""
-    first, count = dict[str, int](), 0
+    first, count, done = dict[str, int](), 0, 0
     for what, step in process.events():
         if what in ("start", "update"):
             first.setdefault(what, step)
+            done = step
         if plan is None:
             continue
         count += what == ("save" if plan["inside"] else "update")
         if count == plan["after"] and what in (("save",) if plan["inside"] else ("start", "update")):
             time.sleep(plan["delay"])
-            process.kill()
-            unread = [line.split()[0] for line in process._lines]
+            unread, code = process.end(plan["by"])
             # a save that had already ended does not count as a kill inside a save
-            return first, {"step": step, "inside": plan["inside"] and "saved" not in unread}
+            inside = plan["inside"] and "saved" not in dict(unread)
+            done = max([done, *(step for what, step in unread if what == "update")])
+            return first, {"step": step, "inside": inside, "code": code, "done": done}
     return first, None
 
 
+def check_left(story: str, folder: Path, plan: dict[str, Any], left: dict[str, Any], found: int) -> None:
+    """Fail unless a process that was asked to stop ended in order and lost no update that it had recorded."""
+    wanted = 128 + signal.Signals[plan["by"]]
+    if not (left["code"] == wanted or (folder / "summary.json").exists()) or found < left["done"]:
+        raise SystemExit(f"{story}: {plan} ended with {left}, the newest checkpoint is that of step {found}")
+
+
 def check_first(story: str, begin: int, first: dict[str, int], steps: list[int]) -> None:
-    """Fail unless a process began at the newest checkpoint and its first row is the next one."""
-    row = next((step for step in steps if step > begin), None)
+    """Fail unless a process began at the newest checkpoint and its first row is the next one, or that of the
+    checkpoint itself where it was not recorded yet (``steps``: it alone).
+    """
+    row = steps[0] if steps == [begin] else next((step for step in steps if step > begin), None)
     if first.get("start", begin) != begin or first.get("update", row) != row:
         raise SystemExit(f"{story}: a resume from checkpoint {begin} began with {first}, expected row {row}")
 
@@ -396,7 +430,7 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     here = [name for name in STORIES if name not in NEEDS or importlib.util.find_spec(NEEDS[name])]
     parser.add_argument("--stories", nargs="+", choices=[*STORIES], default=here)
-    parser.add_argument("--kills", type=int, default=25, help="of each story")
+    parser.add_argument("--kills", type=int, default=12, help="of each story")
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no more is killed")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cost", type=int, metavar="STEPS", help="measure checkpoints instead")
