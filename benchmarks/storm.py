@@ -5,12 +5,13 @@
     python benchmarks/storm.py --cost
 
 Every kill is a SIGKILL at a random moment drawn from a seed: some milliseconds after the k-th update of a
-process, or inside a save, which a shim in this script slows down. Beside them come SIGTERM and SIGINT, after
-which the process has to end with 143 or 130 and a checkpoint of its newest update. There is no manual step in
-between. The storm records the newest valid checkpoint at each kill. It fails unless the resumed process begins
-there and its first new row is the next one. At the end of the run all its results are compared: SHA-256 of weights,
-optimiser and normalisers, generators and counters, and every row of every .jsonl file, except ``seconds`` and
-``time/*``. If a run ends before all kills are used, another one follows.
+process, or inside a save, which a shim in this script slows down. Between them come SIGTERM and SIGINT, after
+which the process has to end with 143 or 130, and with a checkpoint that holds every update that was reported.
+There is no manual step in between. The storm records the newest valid checkpoint at each kill. It fails
+unless the resumed process begins there and its first new row is the next one. At the end of the run all its
+results are compared: SHA-256 of weights, optimiser and normalisers, generators and counters, and every row of
+every .jsonl file, except ``seconds`` and ``time/*``. If a run ends before all kills are used, another one
+follows.
 
 Processes are forked from this one, which has imported the library and never trained: importing takes most of
 the time of a short process, and a resume cannot depend on it.
@@ -258,7 +259,7 @@ def _live(story: str, folder: Path, slow: bool, out: int) -> int:
 
 
 def newest(folder: Path) -> tuple[int, bool]:
-    """The step of the newest valid checkpoint, 0 if there is none, and whether its row is not recorded yet."""
+    """The step of the newest valid checkpoint, 0 without one, and whether its row is not recorded yet."""
     from tightrope.runs import checkpoint
     from tightrope.runs.run import Run
 

@@ -11,15 +11,29 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from control.test_resume import assert_same_end, killed, settings_for
+from control.test_resume import Killed, assert_same_end, killed, settings_for
 
 import tightrope
+from tightrope.cli.main import main
 from tightrope.control import train
 from tightrope.control.agent import Agent
 from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.control.rollout import replay
 from tightrope.runs import growing, signals
 from tightrope.runs.run import Run
+
+
+def fifth(real: Any) -> Any:
+    """A function that ends the run at once in its fifth call."""
+    calls = iter(range(1, 6))
+
+    def wrapped(*arguments: Any) -> Any:
+        if next(calls) == 5:
+            raise Killed
+        return real(*arguments)
+
+    return wrapped
+
 
 OFTEN = {"engine": "torch", "checkpoint_every": 0.01, "evaluate_every": None, "total_steps": 1300}
 
@@ -160,6 +174,22 @@ def test_a_signal_ends_a_replay_at_once_and_loses_nothing(dead, number):
     assert_same_end(run.with_name("whole"), run)
 
 
+def test_the_command_that_was_left_in_a_replay_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    run = tmp_path / "run"
+    words = ["--total-steps", "600", "--num-envs", "4", "--num-steps", "25", "--minibatch-size", "50"]
+    words += ["--engine", "torch", "--checkpoint-every", "0.2", "--run-dir", str(run)]
+    with pytest.raises(Killed), monkeypatch.context() as patch:
+        patch.setattr(Agent, "_log_ratio_limit", fifth(Agent._log_ratio_limit))
+        main(["train", "Pendulum-v1", *words])
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr(replay, "replay", lambda *arguments: os.kill(os.getpid(), signal.SIGINT))
+        assert main(["resume", str(run)]) == 130
+    said = capsys.readouterr().err
+    assert "Stopped by SIGINT at step 400. It is saved in" in said
+    assert said.endswith(f"Go on with:\n  tightrope resume {run}\n")
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="interrupts the main thread")
 def test_a_step_that_hangs_in_a_replay_ends_with_env_timeout(tmp_path, monkeypatch):
     settings = settings_for(Clock, **{**OFTEN, "env_timeout": 1.0})
@@ -169,3 +199,16 @@ def test_a_step_that_hangs_in_a_replay_ends_with_env_timeout(tmp_path, monkeypat
     with pytest.raises(EnvironmentFault, match="env_timeout"):
         train.resume(tmp_path / "run", env=Clock)
     assert time.monotonic() - begin < 20
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="interrupts the main thread")
+def test_a_copy_that_hangs_in_the_test_of_a_run_ends_with_env_timeout(tmp_path):
+    here = os.getpid()
+    Clock.at = lambda env: time.sleep(60) if env.time == 60 and os.getpid() != here else None
+    said: list[str] = []
+    settings = settings_for(Clock, **{**OFTEN, "env_timeout": 1.0})
+    begin = time.monotonic()
+    train.train(settings, run_dir=tmp_path / "run", env=Clock, listeners=[lambda e: said.append(str(e))])
+    told = [line for line in said if line.startswith("Whether episodes repeat is not tested")]
+    assert len(told) == 1 and "env_timeout" in told[0]
+    assert time.monotonic() - begin < 30

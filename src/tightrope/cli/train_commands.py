@@ -153,8 +153,9 @@ def _watched(command: str, given: Options, which: int, *args: Any, **values: Any
         with shown:
             ended = _functions(command)[which](*args, **values, listeners=[shown])
     except KeyboardInterrupt as error:
-        again = _command("resume", shown.run, given) if shown.run else ""
-        print(farewell(error, shown.run, shown.step, view.counted, again), file=sys.stderr)
+        run = args[0] if which == RESUME else shown.run
+        again = _command("resume", run, given) if run else ""
+        print(farewell(error, run, shown.step, view.counted, again), file=sys.stderr)
         return error.code if isinstance(error, signals.Stopped) else 130
     except CannotWrite as error:
         if shown.run and error.command:

@@ -69,9 +69,10 @@ def difference_of(environments: Environments, ended: Repeatable) -> str:
     """
     seeding, reading, name = environments.seeding, environments.reading, environments.spec_id
     maker, logs = environments.makers[-1], {f"0.{ended.episode}": np.concatenate(ended.parts)}
+    policy = FaultPolicy(timeout=environments.policy.timeout)
 
     def repeat(stack: contextlib.ExitStack) -> list[str]:
-        twin = EnvironmentPool([maker], 1, name, policy=FaultPolicy(timeout=None), reading=reading)
+        twin = EnvironmentPool([maker], 1, name, policy=policy, reading=reading)
         stack.callback(twin.close)
         twin.reseed_after, twin.carried_names = seeding.reseed_after, seeding.carried
         origins = np.array([[ended.episode, 0, ended.steps]])
