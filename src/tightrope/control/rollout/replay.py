@@ -8,6 +8,7 @@ of the observation, the reward and the action mask, and both flags. A replay com
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -27,6 +28,7 @@ PRINTS = 2  # int32 columns of a fingerprint: the observation; reward, mask and 
 KEYS = np.random.Generator(np.random.PCG64(0x7274)).integers(0, 2**63, 1 << 12, np.uint64) * np.uint64(2)
 KEYS += np.uint64(1)
 NOTHING = np.zeros(1, np.uint32)
+UPPER = int(sys.byteorder == "little")  # place of the upper half of a 64-bit word
 REWARD, MASK = np.uint32(0xFFFFFF00), np.uint32(0xFC)  # bits of the second column; the last two are the flags
 TELL_AFTER, LONG = 2.0, 10.0  # seconds of a replay: when its length is estimated, and from which it is told
 Groups = dict[str, dict[str, torch.Tensor]]  # tensors by group and name
@@ -51,7 +53,8 @@ def digests(array: Array, leading: int = 1) -> Array:
 
 
 def _folded(hashes: Array) -> Array:
-    return (hashes ^ (hashes >> np.uint64(32))).astype(np.uint32)
+    halves = hashes.view(np.uint32)
+    return halves[..., ::2] ^ halves[..., 1::2]
 
 
 def of_observations(inputs: Inputs, leading: int = 1) -> Array:
@@ -71,11 +74,11 @@ def of_masks(mask: Array | None, leading: int = 1) -> Array:
 
 def of_steps(rewards: Array, terminated: Array, truncated: Array) -> Array:
     """uint32 [...]: fingerprints of rewards float64 and flags."""
-    found = np.ascontiguousarray(rewards, np.float64).view(np.uint64) * KEYS[1]
-    found >>= np.uint64(32)  # the upper half, on which every bit has an effect
-    found &= np.uint64(REWARD)
-    found |= terminated.view(np.uint8) << 1 | truncated.view(np.uint8)
-    return found.astype(np.uint32)
+    hashes = np.ascontiguousarray(rewards, np.float64).view(np.uint64) * KEYS[1]
+    found = hashes.view(np.uint32)[..., UPPER::2] & REWARD  # the half on which every bit has an effect
+    found |= terminated.view(np.uint8) << 1
+    found |= truncated.view(np.uint8)
+    return found
 
 
 # --------------------------------------------------------------------------------------------- recording
