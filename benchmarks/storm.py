@@ -326,11 +326,11 @@ def killed_in(log: list[dict[str, Any]]) -> int:
 
 def follow(process: Process, plan: dict[str, Any] | None) -> tuple[dict[str, int], dict[str, Any] | None]:
     """Watch a process and kill it as planned; returns its first step, its first row and the kill."""
-    first, count, done = dict[str, int](), 0, 0
+    first, count, reported = dict[str, int](), 0, 0
     for what, step in process.events():
         if what in ("start", "update"):
             first.setdefault(what, step)
-            done = step
+            reported = step
         if plan is None:
             continue
         count += what == ("save" if plan["inside"] else "update")
@@ -339,15 +339,15 @@ def follow(process: Process, plan: dict[str, Any] | None) -> tuple[dict[str, int
             unread, code = process.end(plan["by"])
             # a save that had already ended does not count as a kill inside a save
             inside = plan["inside"] and "saved" not in dict(unread)
-            done = max([done, *(step for what, step in unread if what == "update")])
-            return first, {"step": step, "inside": inside, "code": code, "done": done}
+            reported = max([reported, *(step for what, step in unread if what == "update")])
+            return first, {"step": step, "inside": inside, "code": code, "reported": reported}
     return first, None
 
 
 def check_left(story: str, folder: Path, plan: dict[str, Any], left: dict[str, Any], found: int) -> None:
     """Fail unless a process that was asked to stop ended in order and lost no update that it had recorded."""
     wanted = 128 + signal.Signals[plan["by"]]
-    if not (left["code"] == wanted or (folder / "summary.json").exists()) or found < left["done"]:
+    if not (left["code"] == wanted or (folder / "summary.json").exists()) or found < left["reported"]:
         raise SystemExit(f"{story}: {plan} ended with {left}, the newest checkpoint is that of step {found}")
 
 

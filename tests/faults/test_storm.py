@@ -24,5 +24,5 @@ def test_a_small_storm(tmp_path, story, seed):
     ended = subprocess.run([sys.executable, SCRIPT, *words], capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     found = json.loads((tmp_path / "out.json").read_text())["stories"][story]
-    assert found["kills"] == 3 and found["all_equal"] and len(found["log"]) == 3
+    assert found["kills"] == 3 and found["all_equal"] and len(found["log"]) == 3 + found["signals"]
     assert {entry["run"] for entry in found["log"]} <= {1, 2, 3}

@@ -1,3 +1,3 @@
 """Collecting rollouts, and episodes with a frozen policy."""
 
-__all__ = ["collector", "episodes", "evaluation", "replay", "rollout", "running"]
+__all__ = ["collector", "episodes", "evaluation", "replay", "rollout"]

@@ -220,7 +220,7 @@ class Collector:
             self._state = self.environments.get_state()
         if self._running is not None:
             seen, limit = (self._inputs, self._action_mask), self.replay_limit
-            self._running = replay.recorded(self._running, rollout, *seen, self.environments, limit)
+            self._running = replay.continued(self._running, rollout, *seen, self.environments, limit)
 
     def _cleared(self, num_steps: int) -> Rollout:
         rollout = self._rollout

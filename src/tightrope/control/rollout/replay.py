@@ -145,7 +145,7 @@ def begun(environments: Environments, inputs: Inputs, mask: Array | None) -> Run
     return Running(origins, first, [[] for _ in range(len(origins))], environments.carried())
 
 
-def recorded(
+def continued(
     running: Running,
     rollout: Rollout,
     inputs: Inputs,
