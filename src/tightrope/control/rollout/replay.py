@@ -285,7 +285,7 @@ def replay(
     """
     origins, width = saved.origins, environments.action_layout.num_columns
     names = [_name(row, episode) for row, episode in enumerate(origins[:, 0].tolist())]
-    missing = np.array([steps > 0 and names[row] not in logs for row, steps in enumerate(origins[:, 2])])
+    missing = (origins[:, 2] > 0) & (not logs)
     lost = missing | (origins[:, 2] < 0)
     lengths = np.where(lost, 0, origins[:, 2])
     longest, copies = int(lengths.max()), len(lengths)
