@@ -131,7 +131,9 @@ def test_channels_are_found_first_or_last(shape, sides):
     ("space", "readers"),
     [  # the encoders that read it as an image
         (spaces.Box(0, 255, (84, 84, 3), np.uint8), "auto cnn old"),
-        (spaces.Box(0, 255, (1, 8, 9), np.uint8), "auto cnn old"),
+        (spaces.Box(0, 255, (1, 16, 17), np.uint8), "auto cnn old"),
+        (spaces.Box(0, 255, (1, 15, 17), np.uint8), "cnn old"),  # too small for convolutions to be worth it
+        (spaces.Box(0, 255, (1, 8, 9), np.uint8), "cnn old"),
         (spaces.Box(0, 1, (8, 8), np.uint8), "cnn old"),  # a board
         (spaces.Box(0, 255, (5, 5), np.uint8), "cnn"),
         (spaces.Box(0, 255, (3, 5, 5), np.uint8), "cnn"),

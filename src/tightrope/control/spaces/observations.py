@@ -35,7 +35,7 @@ def is_image(space: Space, encoder: str) -> bool:
     """Whether convolutions read a space (channels first or last); otherwise its numbers are flat inputs.
 
     Only a Box of rank 2 or 3 whose bounds are useful (see `useful_bounds`) can be an image. ``auto``: bytes
-    of 0..255 with both sides at least 8, or anything with both sides at least 36: a smaller board is learnt
+    of 0..255 with both sides at least 16, or anything with both sides at least 36: a smaller board is learnt
     better flat and normalised. ``cnn``: from 5 x 5 on. ``mlp``: nothing. ``old``: uint8 from 8 x 8 on.
     """
     if encoder == "mlp" or not isinstance(space, spaces.Box) or len(space.shape) not in (2, 3):
@@ -46,7 +46,7 @@ def is_image(space: Space, encoder: str) -> bool:
     if side < SMALLEST_IMAGE or not useful_bounds(space).all():
         return False
     full = of_bytes and bool((space.low == 0).all() and (space.high == 255).all())
-    return encoder == "cnn" or (full and side >= 8) or side >= 36
+    return encoder == "cnn" or (full and side >= 16) or side >= 36
 
 
 def spatial_sides(shape: tuple[int, ...]) -> tuple[int, int]:
