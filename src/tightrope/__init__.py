@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tightrope.control.agent import A2C, PPO, Reinforce
     from tightrope.control.saving import load
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 __all__ = ["A2C", "PPO", "Reinforce", "TightropeError", "__version__", "load"]
 
 _HOMES = {

@@ -80,7 +80,11 @@ class Agent:
             self.environments = _environments(env, present)
         torch_device = usable_device(present.device)
         layouts = (self.environments.observation_layout, self.environments.action_layout)
-        self._require_room(present, policy)
+        try:
+            require_room(present, *layouts, own_policy=policy is not None)
+        except DoesNotFit:
+            self.environments.close()
+            raise
         threads = present.threads or (available_cores() if layouts[0].images else 1)
         with limited_threads(threads), generators.apart(present.seed):  # QR's bits depend on the threads
             self.policy = Policy(*layouts, present, policy).to(torch_device)
@@ -110,15 +114,6 @@ class Agent:
             for text in without_effect(present, self.environments.action_layout):
                 notify(text)
 
-    def _require_room(self, settings: TrainSettings, policy: Any) -> None:
-        environments = self.environments
-        layouts = (environments.observation_layout, environments.action_layout)
-        try:
-            require_room(settings, *layouts, own_policy=policy is not None)
-        except DoesNotFit:
-            environments.close()
-            raise
-
     # ---------------------------------------------------------------------------------------------- learning
 
     def learn(self, total_steps: int | None = None) -> Agent:
@@ -135,10 +130,9 @@ class Agent:
         ``start``: the agent step at which this budget began (default: now). Ctrl-C drops a rollout at once
         and lets an update finish, or undoes a long one; the agent is then as it was between two updates.
         """
-        if isinstance(total_steps, float) and total_steps.is_integer():
-            total_steps = int(total_steps)  # learn(1e6)
-        given = {} if total_steps is None else {"total_steps": total_steps}
-        budget = self.settings.with_values(**given).total_steps
+        given: Any = self.settings.total_steps if total_steps is None else total_steps
+        given = int(given) if isinstance(given, float) and given.is_integer() else given  # learn(1e6)
+        budget = self.settings.with_values(total_steps=given).total_steps
         start = self.steps if start is None else start
         if start == self.steps:
             self.require_enough(budget)
@@ -156,8 +150,8 @@ class Agent:
                 after = self.steps - start
                 on_grid = crosses(before, after, budget, self.settings.checkpoint_every)
                 self.failed = rollout.failed
-            usual, longest = self.environments.max_episode_steps or USUAL, self.collector.longest()
-            if line := self.episodes.silence(self.steps, bool(rollout.episodes), budget, longest, usual):
+            usual = self.environments.max_episode_steps or USUAL
+            if line := self.episodes.silence(rollout, self.steps, budget, self.collector.longest(), usual):
                 self.notify(line)
             yield Update(after, budget, metrics, before, on_grid, rollout.episodes, seeds=rollout.seeds)
 

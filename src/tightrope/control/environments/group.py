@@ -39,8 +39,8 @@ from tightrope.control.spaces.structure import MASK_KEY, Inputs, Reading
 from tightrope.runs import generators
 
 # types of flags and rewards that need no look at each step
-FLAGS = frozenset((bool, np.bool_))
-NUMBERS = frozenset((float, int, np.float64, np.float32))
+FLAG_TYPES = frozenset((bool, np.bool_))
+REWARD_TYPES = frozenset((float, int, np.float64, np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,9 +278,9 @@ class EnvGroup:
                     _check_step(result, has_masks)
                 observation, reward, terminated, truncated, info = result
                 if not (
-                    type(terminated) in FLAGS
-                    and type(truncated) in FLAGS
-                    and type(reward) in NUMBERS
+                    type(terminated) in FLAG_TYPES
+                    and type(truncated) in FLAG_TYPES
+                    and type(reward) in REWARD_TYPES
                     and type(info) is dict
                 ):  # numpy would store most of these all the same
                     _check_step(result, has_masks)

@@ -26,12 +26,12 @@ class FinishedEpisodes:
         self.longest: float = 0
         self._heard: int | None = 0  # when an episode last finished; None: it was told that none does
 
-    def silence(self, step: int, ended: bool, budget: int, longest: int, usual: int) -> str | None:
-        """A line, once, where no episode has ended for a quarter of the budget, and not because they are just
-        long. ``ended``: one has since the last call; ``longest``: steps of the longest that runs; ``usual``:
-        of one that is not too long.
+    def silence(self, rollout: Rollout, step: int, budget: int, longest: int, usual: int) -> str | None:
+        """A line after a rollout, once, where no episode has ended for a quarter of the budget, and not
+        because they are just long. ``longest``: steps of the longest that runs; ``usual``: of one that is not
+        too long.
         """
-        if ended and self._heard is not None:
+        if rollout.episodes and self._heard is not None:
             self._heard = step
         if self._heard is None or step - self._heard <= budget / 4 or longest <= usual:
             return None
