@@ -213,7 +213,7 @@ def test_forced_engine_names_what_it_does_not_cover():
 class Images(gym.Env):
     """Bright or dark images; the brightness is the right answer."""
 
-    observation_space = spaces.Box(0, 255, (12, 12, 1), np.uint8)
+    observation_space = spaces.Box(0, 255, (16, 16, 1), np.uint8)
     action_space = spaces.Discrete(2)
 
     def reset(self, *, seed=None, options=None):
@@ -223,7 +223,7 @@ class Images(gym.Env):
 
     def _draw(self):
         self.bright = int(self.np_random.integers(2))
-        return np.full((12, 12, 1), 40 + 150 * self.bright, np.uint8)
+        return np.full((16, 16, 1), 40 + 150 * self.bright, np.uint8)
 
     def step(self, action):
         reward = float(action == self.bright)
