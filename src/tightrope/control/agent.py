@@ -36,9 +36,8 @@ from tightrope.control.policy.normalise import Normalisers
 from tightrope.control.policy.policy import Policy
 from tightrope.control.resolve import anywhere, require_room, resolve, resolved, without_effect
 from tightrope.control.rollout.collector import Collector
-from tightrope.control.rollout.episodes import FinishedEpisodes
 from tightrope.control.rollout.replay import Before, begin
-from tightrope.control.rollout.rollout import Rollout, cut_shares, to_batch
+from tightrope.control.rollout.rollout import FinishedEpisodes, Rollout, cut_shares, to_batch
 from tightrope.control.settings import TrainSettings
 from tightrope.control.spaces.structure import Array, Inputs, Reading, bounds_of, structure
 from tightrope.maths.values import explained_variance
@@ -248,6 +247,7 @@ class Agent:
         if isinstance(present, PPOSettings) and present.kl_beta and present.kl_adapt and kl is not None:
             self.kl_beta = ppo.next_kl_beta(present.kl_beta, kl, present.kl_adapt)
         self.normalisers.update(rollout)
+        self.collector.record(rollout)
         self.steps += rollout.steps
         finish = time.perf_counter()
         metrics |= _settings_metrics(present) | self.episodes.add(rollout)

@@ -1,3 +1,3 @@
 """Collecting rollouts, and episodes with a frozen policy."""
 
-__all__ = ["collector", "episodes", "evaluation", "replay", "rollout"]
+__all__ = ["collector", "evaluation", "replay", "rollout"]

@@ -156,6 +156,7 @@ class Collector:
             if warm_up and not earlier:
                 assert self.normalisers.observations is not None
                 self.normalisers.observations.update(rollout.raw[rollout.mask])
+                self.record(rollout)
                 earlier = rollout.counts()
         return rollout
 
@@ -183,7 +184,6 @@ class Collector:
         rollout.failed = [episode for episode in found if episode is not None]
         rollout.episodes = [episode for _, episode, _ in ended]
         rollout.seeds = [seed for _, _, seed in ended]
-        self._log(rollout)
         self._step_count += num_steps
         return rollout
 
@@ -214,13 +214,51 @@ class Collector:
             [plain(layout.to_env_single(action)) for action in actions],
         )
 
-    def _log(self, rollout: Rollout) -> None:
-        """Keep what the running episodes need to continue from here."""
+    def record(self, rollout: Rollout) -> None:
+        """Record what running episodes need to continue after a rollout: what came before each copy's last
+        seeded reset is forgotten, and a log of more than ``replay_limit`` steps is dropped.
+
+        After the update: one that is not complete is collected again, from what was recorded before it.
+        """
         if self.environments.gives_state:
             self._state = self.environments.get_state()
-        if self._running is not None:
-            seen, limit = (self._inputs, self._action_mask), self.replay_limit
-            self._running = replay.continued(self._running, rollout, *seen, self.environments, limit)
+        running = self._running
+        if running is None:
+            return
+        copies, num_steps, width = rollout.actions.shape
+        observed = {name: x for name, x in rollout.inputs.items() if name not in ("flat", "action_mask")}
+        if rollout.raw.size:
+            observed["flat"] = rollout.raw
+        seen = np.empty((copies, num_steps + 1), np.uint32)  # before each step, and behind the last
+        seen[:, :-1], seen[:, -1] = replay.of_observations(observed, 2), replay.of_observations(self._inputs)
+        present, rest = seen, replay.of_steps(rollout.rewards, rollout.terminated, rollout.truncated)
+        if self._action_mask is not None:
+            before, behind = rollout.inputs["action_mask"], self._action_mask
+            masks = np.column_stack([replay.of_masks(before, 2), replay.of_masks(behind)])
+            present, rest = seen ^ masks, rest | masks[:, 1:]
+        rows = np.empty((copies, num_steps, width + replay.PRINTS), np.int32)
+        rows[:, :, :width] = rollout.actions.view(np.int32)
+        rows[:, :, width], rows[:, :, width + 1] = seen[:, 1:].view(np.int32), rest.view(np.int32)
+
+        origins, first = running.origins + np.array((0, 0, num_steps)), running.first
+        carried, ended = running.carried, None
+        if rollout.origins:
+            last, after = rollout.origins[-1]
+            origins = after + np.array((0, 0, num_steps - 1 - last))
+            carried = None if carried is None else self.environments.carried()
+            over = next((t for t, x in rollout.origins if x[0, 0] != running.origins[0, 0]), None)
+            if over is not None and rollout.mask[0, over]:  # not cut by a fault
+                ended = running.of_first_copy(rows[0, : over + 1])
+            begins = np.maximum(num_steps - origins[:, 2], 0)
+            first = np.where(begins > 0, present[np.arange(copies), begins], first)
+        parts: list[list[Array] | None] = []
+        for row, length in enumerate(origins[:, 2].tolist()):
+            earlier = [] if length < num_steps else running.parts[row]
+            if earlier is None or length > self.replay_limit:
+                parts.append(None)
+            else:
+                parts.append([*earlier, rows[row, -length:]] if length else [])
+        self._running = replay.Running(origins, first, parts, carried, ended)
 
     def _cleared(self, num_steps: int) -> Rollout:
         rollout = self._rollout

@@ -19,7 +19,6 @@ import torch
 from tightrope.control.environments import state as states
 from tightrope.control.environments.base import Environments
 from tightrope.control.environments.episode import TRAINING, Start
-from tightrope.control.rollout.rollout import Rollout
 from tightrope.control.spaces.structure import Array, Inputs
 from tightrope.runs.growing import GROUP as ACTIONS
 
@@ -143,52 +142,6 @@ def begun(environments: Environments, inputs: Inputs, mask: Array | None) -> Run
         return None
     first = of_observations(inputs) ^ of_masks(mask)
     return Running(origins, first, [[] for _ in range(len(origins))], environments.carried())
-
-
-def continued(
-    running: Running,
-    rollout: Rollout,
-    inputs: Inputs,
-    mask: Array | None,
-    environments: Environments,
-    limit: int,
-) -> Running:
-    """After a rollout, with the observations and masks behind it: what came before each copy's last seeded
-    reset is forgotten, and a log of more than ``limit`` steps is dropped.
-    """
-    copies, num_steps, width = rollout.actions.shape
-    observed = {name: x for name, x in rollout.inputs.items() if name not in ("flat", "action_mask")}
-    if rollout.raw.size:
-        observed["flat"] = rollout.raw
-    seen = np.empty((copies, num_steps + 1), np.uint32)  # before each step, and behind the last
-    seen[:, :-1], seen[:, -1] = of_observations(observed, 2), of_observations(inputs)
-    present, rest = seen, of_steps(rollout.rewards, rollout.terminated, rollout.truncated)
-    if mask is not None:
-        masks = np.column_stack([of_masks(rollout.inputs["action_mask"], 2), of_masks(mask)])
-        present, rest = seen ^ masks, rest | masks[:, 1:]
-    rows = np.empty((copies, num_steps, width + PRINTS), np.int32)
-    rows[:, :, :width] = rollout.actions.view(np.int32)
-    rows[:, :, width], rows[:, :, width + 1] = seen[:, 1:].view(np.int32), rest.view(np.int32)
-
-    origins, first = running.origins + np.array((0, 0, num_steps)), running.first
-    carried, ended = running.carried, None
-    if rollout.origins:
-        last, after = rollout.origins[-1]
-        origins = after + np.array((0, 0, num_steps - 1 - last))
-        carried = None if carried is None else environments.carried()
-        over = next((t for t, x in rollout.origins if x[0, 0] != running.origins[0, 0]), None)
-        if over is not None and rollout.mask[0, over]:  # not cut by a fault
-            ended = running.of_first_copy(rows[0, : over + 1])
-        begins = np.maximum(num_steps - origins[:, 2], 0)
-        first = np.where(begins > 0, present[np.arange(copies), begins], first)
-    parts: list[list[Array] | None] = []
-    for row, length in enumerate(origins[:, 2].tolist()):
-        earlier = [] if length < num_steps else running.parts[row]
-        if earlier is None or length > limit:
-            parts.append(None)
-        else:
-            parts.append([*earlier, rows[row, -length:]] if length else [])
-    return Running(origins, first, parts, carried, ended)
 
 
 # ------------------------------------------------------------------------------------- saving, continuing

@@ -1,5 +1,7 @@
-"""What supervised fine-tuning and reward modelling share: the state of a run, and one optimiser step.
+"""What supervised fine-tuning and reward modelling share: a run, new or resumed, its state, and one optimiser
+step.
 
+Files are read again when a run is resumed; an object in Python must be given again. A step:
 minibatch -> micro-batches, whose gradients add up -> Adam; held-out examples after every epoch
 """
 
@@ -7,11 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,15 +24,23 @@ from tightrope.algorithms.descent import CheckedSteps, MicroBatches
 from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam
 from tightrope.language.data.examples import Item
-from tightrope.language.settings import SupervisedSettings
+from tightrope.language.model.architecture import parameter_counts
+from tightrope.language.model.load import quiet_libraries
+from tightrope.language.settings import SupervisedSettings, recorded
+from tightrope.language.supervised.prepare import Loaded, prepared
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import counted, understood
+from tightrope.runs.folders import require_kind
 from tightrope.runs.records import figures
 from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
 from tightrope.settings.fields import scheduled
+from tightrope.training import loop
+from tightrope.training.events import Listener, Listeners
 from tightrope.training.learner import Update, crosses
+from tightrope.training.loop import continue_from, newest_point
 from tightrope.training.parameters import Tensors, restore_tensors, tensors_of
+from tightrope.training.tensorboard import require_tensorboard
 
 
 @dataclass(frozen=True)
@@ -254,3 +265,82 @@ def micro_batches(
     ordered = sorted(items, key=length)
     for start in range(0, len(ordered), size or max(1, len(ordered))):
         yield ordered[start : start + (size or len(ordered))]
+
+
+class Stage(NamedTuple):
+    """A supervised stage: its ``name``, which is also its adapter's; the class of its settings; and
+    ``objective``, which reads the data from what was given, or from the files that the settings name.
+    """
+
+    name: str
+    kind: type[SupervisedSettings]
+    objective: Callable[[Any, Loaded, dict[str, Any], Listeners], Objective]
+
+
+@quiet_libraries()
+def train_stage(
+    stage: Stage,
+    settings: SupervisedSettings,
+    given: dict[str, Any],
+    model: tuple[Any, Any] | None,
+    listeners: Sequence[Listener],
+    run_dir: str | Path | None,
+) -> dict[str, Any]:
+    """Train in a new folder ``run_dir`` (None: named after stage, model and seed); returns the summary."""
+    settings = recorded(settings, **given, model=model and model[0])
+    events = Listeners(listeners)
+    for text in settings.without_effect():
+        events.warn(text)
+    with prepared(settings, stage.name, model, events) as loaded:
+        learner = _learner(settings, loaded, stage.objective(settings, loaded, given, events))
+        require_tensorboard(settings.tensorboard)
+        name = f"{stage.name}-{Path(settings.model).name.strip('<>')}-{settings.seed}"
+        with Run.create(run_dir, settings.to_json(), name) as run:
+            return _train(learner, run, events)
+
+
+@quiet_libraries()
+def resume_stage(
+    stage: Stage,
+    run_dir: str | Path,
+    given: dict[str, Any],
+    model: tuple[Any, Any] | None,
+    listeners: Sequence[Listener],
+) -> dict[str, Any]:
+    """Continue a run; returns the summary.
+
+    ValueError when it is another stage's, or when something that was an object is not given; RunInUse when
+    it has another writer.
+    """
+    events = Listeners(listeners)
+    with Run.open(run_dir, own=True) as run:
+        require_kind(run.path, run.settings, stage.name)
+        settings = stage.kind.from_json(run.settings, run.path / "settings.json")
+        objects = {**given, "model": model and model[0]}
+        for name, value in objects.items():
+            if value is None and str(run.settings.get(name)).startswith("<"):
+                word = shlex.quote(str(run_dir))
+                command = f", or tightrope resume {word} --data FILE" if name == "data" else ""
+                raise ValueError(
+                    f"The {name} of {run_dir} was {run.settings[name]}, an object that no file holds. Give "
+                    f"it again: {name}=... in Python{command}."
+                )
+        settings = recorded(settings, **objects)
+        with prepared(settings, stage.name, model, events) as loaded:
+            objective = stage.objective(settings, loaded, given, events)
+            return _train(_learner(settings, loaded, objective), run, events)
+
+
+def _learner(settings: SupervisedSettings, loaded: Loaded, objective: Objective) -> SupervisedLearner:
+    """The learner, with two lines in words about the model and the data."""
+    trained, total = parameter_counts(loaded.model, objective.parameters)
+    model = f"model: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained"
+    return SupervisedLearner(objective, settings, [model, f"data: {objective.data}"])
+
+
+def _train(learner: SupervisedLearner, run: Run, listeners: Listeners) -> dict[str, Any]:
+    point = newest_point(run, listeners)
+    if point is not None:
+        learner.restore(point)
+    continue_from(learner, run, point)
+    return loop.train(learner, run, listeners)

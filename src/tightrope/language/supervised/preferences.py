@@ -26,9 +26,8 @@ from tightrope.language.model.load import weights_fingerprint, without_weights
 from tightrope.language.model.saving import save_adapter
 from tightrope.language.reward.model import SHIFT, RewardModel
 from tightrope.language.settings import RewardSettings
-from tightrope.language.supervised.fit import Objective, micro_batches
+from tightrope.language.supervised.fit import Objective, Stage, micro_batches, resume_stage, train_stage
 from tightrope.language.supervised.prepare import Loaded, examples_of, precision
-from tightrope.language.supervised.run import Stage, resume_stage, train_stage
 from tightrope.runs.durable import atomic_folder
 from tightrope.training.events import Listener, Listeners
 

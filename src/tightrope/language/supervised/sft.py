@@ -18,9 +18,8 @@ from tightrope.language.generation.distribution import Sampling, token_statistic
 from tightrope.language.model.architecture import attention_window, parts
 from tightrope.language.model.saving import save_model
 from tightrope.language.settings import SFTSettings
-from tightrope.language.supervised.fit import Objective, micro_batches
+from tightrope.language.supervised.fit import Objective, Stage, micro_batches, resume_stage, train_stage
 from tightrope.language.supervised.prepare import Loaded, examples_of, precision
-from tightrope.language.supervised.run import Stage, resume_stage, train_stage
 from tightrope.training.events import Listener, Listeners
 
 PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
