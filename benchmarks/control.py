@@ -44,6 +44,7 @@ TASKS: list[tuple[str, str, int, int, str]] = [
     ("HalfCheetah-v5", "ppo", 1_000_000, 5, "5,650"),
     ("Hopper-v5", "ppo", 1_000_000, 5, "2,480"),
     ("Walker2d-v5", "ppo", 1_000_000, 5, "3,410"),
+    ("ALE/Pong-v5", "ppo", 1_000_000, 1, "none"),
 ]
 # stable-baselines3's zoo: one tuned agent per task, deterministic evaluation; older versions of some tasks
 PEERS = {
@@ -56,6 +57,7 @@ PEERS = {
     "HalfCheetah-v5": "5,819 (v3); CleanRL 1,443 (v4)",
     "Hopper-v5": "2,410 (v3)",
     "Walker2d-v5": "3,479 (v3)",
+    "ALE/Pong-v5": "21.0 (10M, NoFrameskip-v4)",
 }
 FLAGS = {"reinforce-plain": ["--algorithm", "reinforce", "--no-baseline"]}
 
@@ -136,6 +138,11 @@ def measure(task: str, algorithm: str, steps: int, seeds: int, goal: str, jobs: 
     return {**row, **summarise(runs), "runs": runs, "command": command, "machine": machine()}
 
 
+def result_path(task: str, algorithm: str) -> Path:
+    """The committed file of a row."""
+    return RESULTS / f"{task.replace('/', '-')}-{algorithm}.json"
+
+
 def table() -> str:
     """The Markdown table of all committed results."""
     lines = [
@@ -143,7 +150,7 @@ def table() -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for task, algorithm, steps, _, goal in TASKS:
-        path = RESULTS / f"{task}-{algorithm}.json"
+        path = result_path(task, algorithm)
         if not path.is_file():
             continue
         row = json.loads(path.read_text())
@@ -184,7 +191,7 @@ def main() -> None:
         ):
             continue
         row = measure(task, algorithm, steps, chosen.seeds or seeds, goal, chosen.jobs)
-        (RESULTS / f"{task}-{algorithm}.json").write_text(json.dumps(row, indent=1) + "\n")
+        result_path(task, algorithm).write_text(json.dumps(row, indent=1) + "\n")
         print(
             f"{task} {algorithm}: {row['mean']:,.1f} ± {row['ci95']:,.1f} (goal {goal}), worst "
             f"{row['min']:,.1f}",
