@@ -29,7 +29,6 @@ from tightrope.runs.folders import require_kind
 from tightrope.runs.records import write_json
 from tightrope.runs.retention import Checkpoint
 from tightrope.runs.run import Run
-from tightrope.runs.versions import known
 from tightrope.training import loop
 from tightrope.training.events import Listener, Listeners
 from tightrope.training.learner import Update, crosses
@@ -104,8 +103,8 @@ def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, p
         versions = {} if point is None else read_manifest(present(point.folder))["versions"]
         raise ValueError(
             f"{run_dir} was written by tightrope {versions.get('tightrope', 'of an unknown version')}; its "
-            f"checkpoints do not hold what an exact resume by this version, {known()['tightrope']}, needs: "
-            "resume it with that version, or learn on from its policy in Python, "
+            "checkpoints do not hold what an exact resume by this version needs: resume it with that one, or "
+            "learn on from its policy in Python, "
             f"tightrope.load({str(run_dir)!r}{', env=...' if own_environment else ''}).learn(n)."
         )
     if env is None and own_environment:
