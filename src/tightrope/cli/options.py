@@ -457,7 +457,8 @@ def _values_of_file(command: str, path: str) -> Options:
 
 def _refuse_code(command: str, path: str, name: str, value: Any) -> None:
     """UsageError for a value that only the user may give: a Python object or code."""
-    judge = name in ("reward", "gold") and value not in (None, "", "length") and not Path(value).is_dir()
+    known = (None, "", *AlignSettings.BUILT_IN_REWARDS)
+    judge = name in ("reward", "gold") and value not in known and not Path(value).is_dir()
     module = name == "env" and ":" in value
     if judge or module or (isinstance(value, str) and value.startswith("<")):
         word = "FILE.py:function" if name in ("reward", "gold") else "ID" if name == "env" else "FILE"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from tightrope.algorithms.settings import PPOSettings
 from tightrope.settings.fields import SCHEDULES, Schedule, fixed, of_update_rule, setting
@@ -120,6 +120,8 @@ class RLHFSettings(PPOSettings):
 @dataclass(frozen=True, kw_only=True)
 class AlignSettings(ModelSettings):
     """PPO on a causal language model against any reward."""
+
+    BUILT_IN_REWARDS: ClassVar = ("length",)  # words for reward and gold that name no file
 
     data: str = setting("", "The prompts: a .jsonl, .json, .csv or .txt file, or a dataset's id.")
     reward: str = setting("", "length, FILE.py:function, or the folder of a reward model.")

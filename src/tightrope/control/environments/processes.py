@@ -145,7 +145,7 @@ class WorkerProcess:
         except (TimeoutError, BlockingIOError) as error:
             self._process.kill()
             what = f"has not answered for {self._patience:g} s (env_timeout); is the environment stuck?"
-            raise self._lost(what) from error
+            raise self._lost(what, "Give a larger env_timeout if its steps may take that long.") from error
         except OSError as error:
             raise self._lost("has died") from error
         if reply not in (READY, MASKED):
@@ -223,12 +223,13 @@ class WorkerProcess:
         except EOFError as error:
             raise self._lost("has died") from error
 
-    def _lost(self, what: str) -> EnvironmentFault:
+    def _lost(
+        self, what: str, advice: str = "Try vector_backend serial, which shows the environment's own error."
+    ) -> EnvironmentFault:
         self._process.join(1.0)
         return EnvironmentFault(
             f"worker {self.number} of {self.name} (environments from {self.first} on) {what} "
-            f"(exit code {self._process.exitcode}). Try vector_backend serial, which shows the environment's "
-            "own error.",
+            f"(exit code {self._process.exitcode}). {advice}",
             self.first,
             env_id=self.name,
             worker=self.number,

@@ -126,7 +126,7 @@ def _require_what_no_file_gives(
     """ValueError for prompts and judges that were objects and are not given again."""
     for name, value in (("reward", reward), ("gold", gold)):
         known = getattr(settings, name)
-        if value is None and known not in (None, "length") and not Path(known).is_dir():
+        if value is None and known not in (None, *settings.BUILT_IN_REWARDS) and not Path(known).is_dir():
             raise ValueError(
                 f"The {name} of {run_dir} was {known!r}: code, which no file may import, or a folder that is "
                 "not there any more. If it is yours, or you have read it, name it again: tightrope resume "
