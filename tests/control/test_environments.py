@@ -165,7 +165,7 @@ def test_same_step_without_the_final_observation_is_refused():
         (lambda o, r, te, tr, i: (o[:1], r, te, tr, i), "expected 2 rows"),
         (lambda o, r, te, tr, i: (o[:, :2], r, te, tr, i), r"shape \(2, 2\), expected \(N, 3\)"),
         (lambda o, r, te, tr, i: (o, r[:, None], te, tr, i), r"have shapes \(2, 1\)"),
-        (lambda o, r, te, tr, i: (o, ["a", "b"], te, tr, i), "not arrays of numbers"),
+        (lambda o, r, te, tr, i: (o, ["a", "b"], te, tr, i), "expected numbers and two arrays of True and"),
     ],
 )
 def test_a_vector_environment_that_breaks_the_api_is_named(change, message):

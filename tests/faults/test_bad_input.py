@@ -58,7 +58,7 @@ def parameters(agent):
     [
         ("nan", r"Environment 0 .* observation = nan at step 5, index 1"),
         ("inf", r"Environment 0 .* observation = inf at step 5, index 1"),
-        ("nan reward", r"Environment 0 .* reward = nan at step 4"),
+        ("nan reward", r"Environment 0 .* reward = nan at step 5"),
     ],
 )
 def test_nan_from_an_environment_is_named_and_not_learned_from(engine, normalise, fault, words):

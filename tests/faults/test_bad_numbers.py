@@ -50,8 +50,8 @@ def test_what_is_computed_from_a_rollout(agent, site, bad, monkeypatch):
 
     whole = module.to_batch
 
-    def poisoned(*arguments):
-        batch = whole(*arguments)
+    def poisoned(*arguments, **more):
+        batch = whole(*arguments, **more)
         if site == "value":
             batch.old_values[1, 7] = float(bad)
         elif site == "advantage":

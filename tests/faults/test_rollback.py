@@ -24,8 +24,8 @@ def poison(monkeypatch, times):
 
     whole, calls, seen = module.to_batch, [0, 0], []
 
-    def poisoned(rollout, *arguments):
-        batch = whole(rollout, *arguments)
+    def poisoned(rollout, *arguments, **more):
+        batch = whole(rollout, *arguments, **more)
         calls[0] += 1
         if calls[0] >= 5 and calls[1] < times:
             calls[1] += 1
@@ -102,7 +102,7 @@ def test_language_rolls_back_continues_and_counts(monkeypatch, tmp_path):
 def test_only_bad_numbers_are_gone_back_for(monkeypatch, tmp_path):
     from tightrope.control import agent as module
 
-    monkeypatch.setattr(module, "to_batch", lambda *_: int("something else"))
+    monkeypatch.setattr(module, "to_batch", lambda *_, **__: int("something else"))
     settings = TrainSettings().with_values(**CONTROL, engine="torch")
     with pytest.raises(ValueError, match="something else"):
         train(settings, run_dir=tmp_path / "run")
