@@ -84,7 +84,7 @@ class Agent:
         except DoesNotFit:
             self.environments.close()
             raise
-        threads = present.threads or (available_cores() if layouts[0].images else 1)
+        threads = present.threads or 1
         with limited_threads(threads), generators.apart(present.seed):  # QR's bits depend on the threads
             self.policy = Policy(*layouts, present, policy).to(torch_device)
         self.optimiser = make_optimiser(

@@ -94,7 +94,7 @@ class TrainSettings(Settings):
     device: str = setting("cpu", "Torch device of the networks: cpu, cuda, cuda:1, mps.")
     threads: int | None = setting(
         None,
-        "CPU threads of torch and BLAS; none: 1 for MLPs (more only spin), every core for images.",
+        "CPU threads of torch and BLAS; none: 1. More mostly wait for each other, with images too.",
         at_least=1,
         at_most=1024,
     )
