@@ -4,7 +4,7 @@ numbers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,11 @@ from tightrope.runs.run import Run
 
 @quiet_libraries()
 def sample_run(
-    path: str | Path, prompt: Sequence[Any] | None = None, *, count: int = 8, seed: int | None = None
+    path: str | Path,
+    prompt: Sequence[str | Sequence[Mapping[str, object]]] | None = None,
+    *,
+    count: int = 8,
+    seed: int | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of ``prompt``, ``before`` and ``after`` for a run of align.
 
@@ -42,10 +46,10 @@ def sample_run(
         raise ValueError(
             f"{path} holds no aligned model: the run has not finished, or is not a run of align."
         )
-    rows = list(prompt) if prompt else _prompts_of(path, count)
+    asked = list(prompt) if prompt else _prompts_of(path, count)
     tokenizer = load_tokenizer(str(path / "model"))
     seed = settings.seed + 1 if seed is None else seed
-    rows = [{"prompt": row} for row in rows]
+    rows = [{"prompt": text} for text in asked]
     prompts = read_prompts(rows, tokenizer, max_tokens=settings.max_prompt_tokens)
     texts = {
         name: _responses(folder, prompts, settings, seed)
@@ -76,4 +80,4 @@ def _responses(folder: str, prompts: Sequence[Prompt], settings: AlignSettings, 
     numbers = np.random.default_rng([seed, 8]).random((len(prompts), settings.max_new_tokens))
     found = sample(model, tokens, real, sampling, torch.from_numpy(numbers), stops)
     rows = zip(found.tokens, found.mask, strict=True)
-    return [tokenizer.decode(ids[mask].tolist(), skip_special_tokens=True) for ids, mask in rows]
+    return [str(tokenizer.decode(ids[mask].tolist(), skip_special_tokens=True)) for ids, mask in rows]

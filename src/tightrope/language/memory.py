@@ -18,7 +18,7 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +28,9 @@ from tightrope.language.model.architecture import Parts, parts
 from tightrope.language.model.load import fused, pretrained, without_weights
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SupervisedSettings
 from tightrope.training.memory import SHARE, DoesNotFit, available_memory
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedConfig
 
 Phase = Literal["always", "rollout", "update"]
 FLOAT = 4  # bytes of a float32: adapters, heads, numbers per step
@@ -124,7 +127,7 @@ class Ledger:
 
     rows: tuple[Entry, ...]
     job: Job
-    config: Any
+    config: PreTrainedConfig
 
     def sum_of(self, phase: Phase) -> int:
         """Bytes of one phase."""
@@ -155,7 +158,7 @@ def amount(size: float) -> str:
     return f"{size / 1e3:.0f} kB"
 
 
-def ledger(config: Any, job: Job) -> Ledger:
+def ledger(config: PreTrainedConfig, job: Job) -> Ledger:
     """The memory that ``job`` needs with a model of this configuration (transformers' PretrainedConfig).
 
     Allocates nothing large. ValueError when the architecture is not known, or has too few layers.
@@ -267,7 +270,11 @@ def require_fit(found: Ledger, available: int | None) -> None:
 
 
 def require_memory(
-    config: Any, job: Job, device: str | torch.device, notify: Callable[[str], None], held: int = 0
+    config: PreTrainedConfig,
+    job: Job,
+    device: str | torch.device,
+    notify: Callable[[str], None],
+    held: int = 0,
 ) -> None:
     """Tell ``notify`` what a job will take, and raise DoesNotFit when it cannot fit on the device.
 
@@ -320,7 +327,7 @@ class Shapes(NamedTuple):
         return sum(rank * (a + b) for layer in self.linears[-layers:] for a, b in layer)
 
 
-def shapes_of(config: Any, dtype: str) -> Shapes:
+def shapes_of(config: PreTrainedConfig, dtype: str) -> Shapes:
     """The shapes of a causal language model of this configuration (transformers' PretrainedConfig).
 
     Allocates nothing large. ValueError when the architecture is not known.

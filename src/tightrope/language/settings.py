@@ -276,7 +276,7 @@ class AlignSettings(ModelSettings):
 AnySettings = TypeVar("AnySettings", bound=ModelSettings)
 
 
-def recorded(settings: AnySettings, **given: Any) -> AnySettings:
+def recorded(settings: AnySettings, **given: object) -> AnySettings:
     """The settings that settings.json keeps of what was given in Python: paths are stored as text. Of an
     object only its name is, in angle brackets, so that nobody takes it for a file, a folder or a reward.
     None keeps the setting.

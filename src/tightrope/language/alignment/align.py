@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.language.alignment.iteration import Trainer
+from tightrope.language.data.examples import Rows
 from tightrope.language.model.load import quiet_libraries
+from tightrope.language.reward.judge import RewardSources
 from tightrope.language.settings import AlignSettings, recorded
 from tightrope.language.supervised.prepare import threads
 from tightrope.runs import signals
@@ -47,12 +49,12 @@ class Aligned:
 def align(
     settings: AlignSettings | None = None,
     *,
-    prompts: Any = None,
-    reward: Any = None,
-    gold: Any = None,
+    prompts: Rows | None = None,
+    reward: RewardSources | None = None,
+    gold: RewardSources | None = None,
     run_dir: str | Path | None = None,
     listeners: Sequence[Listener] = (),
-    **values: Any,
+    **values: object,
 ) -> Aligned:
     """Train a language model against a reward; returns the run.
 
@@ -75,7 +77,13 @@ def align(
             return _train(trainer, run)
 
 
-def _trainer(settings: AlignSettings, prompts: Any, reward: Any, gold: Any, events: Listeners) -> Trainer:
+def _trainer(
+    settings: AlignSettings,
+    prompts: Rows | None,
+    reward: RewardSources | None,
+    gold: RewardSources | None,
+    events: Listeners,
+) -> Trainer:
     """A trainer on what was given, and on what the settings name where nothing was."""
     return Trainer(
         settings,
@@ -96,9 +104,9 @@ def _train(trainer: Trainer, run: Run) -> Aligned:
 def resume_align(
     run_dir: str | Path,
     *,
-    prompts: Any = None,
-    reward: Any = None,
-    gold: Any = None,
+    prompts: Rows | None = None,
+    reward: RewardSources | None = None,
+    gold: RewardSources | None = None,
     total_episodes: int | None = None,
     listeners: Sequence[Listener] = (),
 ) -> Aligned:
@@ -121,7 +129,11 @@ def resume_align(
 
 
 def _require_what_no_file_gives(
-    run_dir: str | Path, settings: AlignSettings, prompts: Any, reward: Any, gold: Any
+    run_dir: str | Path,
+    settings: AlignSettings,
+    prompts: Rows | None,
+    reward: RewardSources | None,
+    gold: RewardSources | None,
 ) -> None:
     """ValueError for prompts and judges that were objects and are not given again."""
     for name, value in (("reward", reward), ("gold", gold)):

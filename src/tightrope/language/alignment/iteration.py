@@ -7,7 +7,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from tightrope.language.alignment.kl import adapted, kl_loss, shared_scale
 from tightrope.language.alignment.monitor import Monitor
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.alignment.samples import sample_rows
-from tightrope.language.data.examples import Prompt, hold_out_prompts, read_prompts, read_rows
+from tightrope.language.data.examples import Prompt, Rows, hold_out_prompts, read_prompts, read_rows
 from tightrope.language.generation.sample import log_ratio_limit
 from tightrope.language.model.architecture import context_length
 from tightrope.language.model.packaged import find_model
@@ -41,6 +41,7 @@ from tightrope.language.reward.call import RewardError
 from tightrope.language.reward.functions import Scores
 from tightrope.language.reward.judge import (
     Judge,
+    RewardSources,
     critic_from_reward,
     folder_of,
     make_judge,
@@ -57,6 +58,9 @@ from tightrope.runs.run import Run
 from tightrope.training.events import Listeners
 from tightrope.training.learner import Update, crosses
 from tightrope.training.parameters import Tensors, restore_tensors, tensors_of, whole_update
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerBase
 
 # what a checkpoint holds of a trainer as it is, and how it is read back
 SAVED: dict[str, Callable[[Any], Any]] = {
@@ -86,7 +90,7 @@ class Taken(NamedTuple):
         """Whether there is a response to learn from."""
         return bool(self.scores.valid.any())
 
-    def rows(self, tokenizer: Any, episodes: int) -> list[dict[str, Any]]:
+    def rows(self, tokenizer: PreTrainedTokenizerBase, episodes: int) -> list[dict[str, Any]]:
         """The responses as samples.jsonl holds them."""
         return sample_rows(
             tokenizer, self.asked, self.experience, self.scores, self.batch, self.valid, episodes
@@ -97,7 +101,12 @@ class Trainer:
     """The state of an alignment run, a `Learner`."""
 
     def __init__(
-        self, settings: AlignSettings, prompts: Any, reward: Any, gold: Any, listeners: Listeners
+        self,
+        settings: AlignSettings,
+        prompts: Rows,
+        reward: RewardSources,
+        gold: RewardSources | None,
+        listeners: Listeners,
     ) -> None:
         self.settings, self.listeners = settings, listeners
         adapter = reward_adapter(reward)
@@ -142,7 +151,7 @@ class Trainer:
         self._update_seconds: float | None = None  # of the newest update
         self._warned = set[tuple[str, str]]()
 
-    def _read_prompts(self, source: Any) -> list[Prompt]:
+    def _read_prompts(self, source: Rows) -> list[Prompt]:
         settings, limit = self.settings, context_length(self.roles.model)
         if limit is not None and settings.max_prompt_tokens + settings.max_new_tokens > limit:
             raise ValueError(
@@ -437,7 +446,7 @@ class Trainer:
         """The KL's share in the loss and the pretraining loss; None when neither is asked for."""
         form, pretraining = self.settings.kl, self.pretraining
 
-        def extra(model: Any, part: Batch, now: FirstPass, count: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        def extra(model: object, part: Batch, now: FirstPass, count: Tensor) -> tuple[Tensor, dict[str, Any]]:
             total, figures = now.logp.new_zeros(()), dict[str, Any]()
             log_ratio = now.logp.detach() - part.old_logp
             kl = kl_loss(form, now.logp, part.inputs["ref_logp"], now.kl, part.mask, count, log_ratio)

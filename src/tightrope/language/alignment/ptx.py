@@ -31,6 +31,7 @@ class Pretraining:
         receives how many were cut.
         """
         longest = settings.max_prompt_tokens + settings.max_new_tokens
+        assert settings.ptx_data is not None  # ptx_weight needs it
         rows = read_rows(settings.ptx_data)
         examples = sft_examples(
             rows, roles.tokenizer, eos=roles.eos, max_tokens=longest, on_completions=False, notify=notify

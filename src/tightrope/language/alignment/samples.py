@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, SupportsFloat, TextIO
 
 from tightrope.maths import divergence
 from tightrope.maths.statistics import masked_mean, masked_sum
 from tightrope.runs.records import read_lines
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from torch import Tensor
+    from transformers import PreTrainedTokenizerBase
 
     from tightrope.algorithms.batch import Batch
     from tightrope.language.data.examples import Prompt
@@ -23,7 +25,7 @@ LONGEST = 300  # characters of a prompt or response in a table
 
 
 def sample_rows(
-    tokenizer: Any,
+    tokenizer: PreTrainedTokenizerBase,
     prompts: Sequence[Prompt],
     experience: Experience,
     scores: Scores,
@@ -81,7 +83,7 @@ def read_samples(path: str | Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _is_sample(row: dict[str, Any]) -> bool:
+def _is_sample(row: Mapping[str, object]) -> bool:
     """Whether a row has everything that the tables show; the file may come from anywhere."""
     scores = row.get("scores")
     texts = (row.get("prompt"), row.get("response"))
@@ -116,7 +118,7 @@ def print_samples(
     *,
     width: int | None = None,
     title: str = "",
-    console: Any = None,
+    console: Console | None = None,
 ) -> None:
     """A table of prompt, response, each function's score, their sum where there are several, KL, advantage.
 
@@ -134,16 +136,18 @@ def print_samples(
     _print_table(["prompt", "response"], heads, lines, stream, width, title, console)
 
 
-def print_comparison(rows: Sequence[dict[str, Any]], stream: TextIO | None = None, **options: Any) -> None:
+def print_comparison(
+    rows: Sequence[dict[str, Any]], stream: TextIO | None = None, *, width: int | None = None, title: str = ""
+) -> None:
     """A table of responses before and after training: rows of ``prompt``, ``before`` and ``after``.
 
-    ``stream`` and ``options`` (``width``, ``title``) as in `print_samples`.
+    ``stream``, ``width`` and ``title`` as in `print_samples`.
     """
     lines = [[row["prompt"], row["before"], row["after"]] for row in rows]
-    _print_table(["prompt", "before", "after"], [], lines, stream, **options)
+    _print_table(["prompt", "before", "after"], [], lines, stream, width, title)
 
 
-def one_line(text: str | list[dict[str, Any]], *, tail: bool = False) -> str:
+def one_line(text: str | Sequence[Mapping[str, object]], *, tail: bool = False) -> str:
     """A text or messages in one short line for a table.
 
     Line ends and other characters that cannot be seen are written as Python writes them. The beginning is
@@ -169,7 +173,7 @@ def _print_table(
     stream: TextIO | None,
     width: int | None = None,
     title: str = "",
-    console: Any = None,
+    console: Console | None = None,
 ) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -188,11 +192,11 @@ def _print_table(
     console.print(table)
 
 
-def _finite(value: Any) -> float | None:
+def _finite(value: SupportsFloat | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def _writable(value: Any) -> Any:
+def _writable(value: object) -> object:
     """``value`` with characters that UTF-8 cannot hold (halves of a surrogate pair) written as escapes."""
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode()

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -24,7 +24,12 @@ from tightrope.language.data import formats
 from tightrope.language.data.batching import Example
 from tightrope.language.data.formats import Encoder, Messages
 
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerBase
+
 Row = dict[str, Any] | str
+# what a user may give as data: a file, the id of a dataset, or rows
+Rows = str | Path | Iterable[str | Mapping[str, object] | Sequence[Mapping[str, object]]]
 Item = TypeVar("Item")
 Notify = Callable[[str], None]
 FILES = (".jsonl", ".json", ".csv", ".txt")
@@ -48,7 +53,7 @@ class Prompt:
     columns: dict[str, Any]
 
 
-def read_rows(source: Any, limit: int | None = None) -> list[Row]:
+def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
     """The first ``limit`` rows (None: all) of a dataset.
 
     ``source``: a .jsonl, .json (a list), .csv or .txt file (a string a line), the id of a dataset on the hub
@@ -117,7 +122,7 @@ def _object(line: str, place: str) -> Any:
         ) from error
 
 
-def _unique(place: str, pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(place: str, pairs: Sequence[tuple[str, object]]) -> dict[str, object]:
     """An object of its pairs. ValueError for a duplicate key: one of its values would be lost."""
     _each_once([key for key, _ in pairs], place)
     return dict(pairs)
@@ -163,7 +168,7 @@ def _read_hub(name: str) -> Any:
 
 def sft_examples(
     rows: Sequence[Row],
-    tokenizer: Any,
+    tokenizer: PreTrainedTokenizerBase,
     *,
     eos: int | Sequence[int],
     max_tokens: int,
@@ -195,7 +200,7 @@ def sft_examples(
 
 def preference_pairs(
     rows: Sequence[Row],
-    tokenizer: Any,
+    tokenizer: PreTrainedTokenizerBase,
     *,
     eos: int | Sequence[int],
     max_tokens: int,
@@ -224,7 +229,11 @@ def preference_pairs(
 
 
 def read_prompts(
-    rows: Sequence[Row], tokenizer: Any, *, max_tokens: int, notify: Notify = warnings.warn
+    rows: Sequence[Row],
+    tokenizer: PreTrainedTokenizerBase,
+    *,
+    max_tokens: int,
+    notify: Notify = warnings.warn,
 ) -> list[Prompt]:
     """Prompts to respond to: plain strings, or ``{"prompt"}`` as a string or a list of messages.
 
@@ -250,7 +259,7 @@ def read_prompts(
             cut, chats = cut + 1, chats + (not isinstance(shown, str))
             tail = tokens[len(opening) - max_tokens :]
             tokens = [*opening, *tail]
-            shown = tokenizer.decode(tail) if isinstance(shown, str) else shown
+            shown = str(tokenizer.decode(tail)) if isinstance(shown, str) else shown
         others = {name: value for name, value in columns.items() if name != "prompt"}
         prompts.append(Prompt(tuple(tokens), shown, others))
     if cut:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerBase
 
 Messages = list[dict[str, Any]]
 Pieces = list[tuple[list[int], bool]]  # tokens, and whether they are learnt
@@ -16,7 +19,7 @@ class Encoder:
     Prompt and reply are tokenised apart, at the place where sampling parts them.
     """
 
-    def __init__(self, tokenizer: Any, eos: int | Sequence[int] = ()) -> None:
+    def __init__(self, tokenizer: PreTrainedTokenizerBase, eos: int | Sequence[int] = ()) -> None:
         self.tokenizer = tokenizer
         self.eos = (eos,) if isinstance(eos, int) else tuple(eos)
         # A probe separates the opening (a BOS, or nothing) from a closing EOS, also where both are one id.
@@ -47,7 +50,7 @@ class Encoder:
         Only blanks may follow it: chat templates write a newline there, which is never sampled.
         """
         last = max((i for i, token in enumerate(tokens) if token in self.eos), default=None)
-        if last is None or self.tokenizer.decode(tokens[last + 1 :]).strip():
+        if last is None or str(self.tokenizer.decode(tokens[last + 1 :])).strip():
             return None
         return last + 1
 
@@ -69,7 +72,7 @@ class Encoder:
             raise ValueError(f"{place}: the chat template refuses these messages ({error}).") from error
         return encodable(text, f"the chat of {place}")
 
-    def chat(self, messages: Messages, place: str, *, first: int = 0, tools: Any = None) -> Pieces:
+    def chat(self, messages: Messages, place: str, *, first: int = 0, tools: object = None) -> Pieces:
         """A chat in pieces; assistant turns from message ``first`` on are learnt, up to their EOS."""
         whole, at = self.render(messages, place, tools=tools), 0
         pieces: Pieces = []
@@ -85,7 +88,7 @@ class Encoder:
             at = end
         return [*pieces, (self.bare(whole[at:]), False)]
 
-    def _turn(self, messages: Messages, index: int, whole: str, place: str, tools: Any) -> tuple[int, int]:
+    def _turn(self, messages: Messages, index: int, whole: str, place: str, tools: object) -> tuple[int, int]:
         """Where an assistant turn begins and ends in the chat's text: its header belongs to the prompt."""
         if index == 0:
             raise ValueError(
@@ -101,14 +104,14 @@ class Encoder:
             )
         return shared(whole, asked), len(until)
 
-    def prompt(self, messages: Messages, place: str, *, tools: Any = None) -> list[int]:
+    def prompt(self, messages: Messages, place: str, *, tools: object = None) -> list[int]:
         """A chat up to the assistant's next turn, or up to where a turn that it has begun continues."""
         begun = messages[-1]["role"] == "assistant"
         options = {"continue_final_message": True} if begun else {"add_generation_prompt": True}
         return self.bare(self.render(messages, place, tools=tools, **options))
 
 
-def supervised(row: dict[str, Any], encoder: Encoder, place: str) -> Pieces:
+def supervised(row: Mapping[str, object], encoder: Encoder, place: str) -> Pieces:
     """The pieces of a row for supervised fine-tuning."""
     if has(row, "prompt", "completion"):
         prompt, completion = read_content(row, "prompt", place), read_content(row, "completion", place)
@@ -128,7 +131,7 @@ def supervised(row: dict[str, Any], encoder: Encoder, place: str) -> Pieces:
     raise missing(row, place, "text, prompt and completion, or messages")
 
 
-def preference(row: dict[str, Any], encoder: Encoder, place: str) -> list[Pieces]:
+def preference(row: Mapping[str, object], encoder: Encoder, place: str) -> list[Pieces]:
     """The pieces of the chosen and of the rejected text of a row."""
     if not has(row, "chosen", "rejected"):
         raise missing(row, place, "chosen and rejected, and prompt unless both contain it")
@@ -167,18 +170,18 @@ def joined(pieces: Pieces, *, everything: bool = False) -> tuple[list[int], list
     return tokens[:end], learn[:end]
 
 
-def shared(first: Sequence[Any], second: Sequence[Any]) -> int:
+def shared(first: Sequence[object], second: Sequence[object]) -> int:
     """The number of leading items that two sequences have in common."""
     pairs = enumerate(zip(first, second, strict=False))
     return next((i for i, (a, b) in pairs if a != b), min(len(first), len(second)))
 
 
-def has(row: dict[str, Any], *columns: str) -> bool:
+def has(row: Mapping[str, object], *columns: str) -> bool:
     """Whether a row has all of these columns; one that holds None does not count."""
     return all(row.get(column) is not None for column in columns)
 
 
-def missing(row: dict[str, Any], place: str, expected: str) -> ValueError:
+def missing(row: Mapping[str, object], place: str, expected: str) -> ValueError:
     """The error for a row without its columns."""
     seen = ", ".join(str(name) for name in row if row[name] is not None) or "none"
     return ValueError(f"{place} has the columns: {seen}; expected {expected}. Rename them in the data.")
@@ -189,7 +192,7 @@ def as_messages(value: str | Messages, role: str) -> Messages:
     return [{"role": role, "content": value}] if isinstance(value, str) else value
 
 
-def read_content(row: dict[str, Any], column: str, place: str) -> str | Messages:
+def read_content(row: Mapping[str, object], column: str, place: str) -> str | Messages:
     """A string of encodable text that is not blank, or a list of messages. ValueError names the row and what
     is wrong.
     """

@@ -137,7 +137,7 @@ class _Chunked(torch.autograd.Function):
         return logp, entropy, kl, theirs
 
     @staticmethod
-    def backward(ctx: Any, *outer: Any) -> tuple[Any, ...]:
+    def backward(ctx: Any, *outer: Tensor) -> tuple[Any, ...]:
         hidden, weight, bias = ctx.saved_tensors[:3]
         need_hidden, need_weight, need_bias = ctx.needs_input_grad[:3]
         states = [g if bool(g.any()) else None for g in outer[1:3]]

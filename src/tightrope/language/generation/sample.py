@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,9 @@ from torch import Tensor, nn
 from tightrope.language.data.batching import positions
 from tightrope.language.generation.distribution import Sampling, next_logits
 from tightrope.language.model.architecture import parts
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel
 
 # A forward pass takes its cache under the old name up to transformers 5.23. From 5.24 on the name is new, and
 # the old one warns at every step. Models outside transformers may keep the old name.
@@ -63,7 +66,7 @@ class Completions:
 
 @torch.no_grad()
 def sample(
-    model: Any,
+    model: PreTrainedModel,
     prompts: Tensor,
     real: Tensor,
     sampling: Sampling,

@@ -9,10 +9,13 @@ measured once and stored on the head, where `generation.distribution.at_head` re
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel
 
 LAYER_NAMES = ("layers", "h", "blocks")
 WINDOW_FIELDS = ("sliding_window", "attention_chunk_size")  # how far back a layer of a config may look
@@ -31,7 +34,7 @@ class Parts(NamedTuple):
     head: nn.Linear
 
 
-def parts(model: Any) -> Parts:
+def parts(model: PreTrainedModel) -> Parts:
     """The base transformer, its decoder layers and the language-model head.
 
     Raises ValueError for an architecture in which they cannot be found, or whose logits are something else
@@ -51,7 +54,7 @@ def parts(model: Any) -> Parts:
     )
 
 
-def context_length(model: Any) -> int | None:
+def context_length(model: PreTrainedModel) -> int | None:
     """How many positions the model knows; None where its config does not tell."""
     for name in ("max_position_embeddings", "n_positions", "n_ctx"):
         if (found := getattr(model.config, name, None)) is not None:
@@ -59,7 +62,7 @@ def context_length(model: Any) -> int | None:
     return None
 
 
-def attention_window(model: Any) -> int | None:
+def attention_window(model: PreTrainedModel) -> int | None:
     """How many tokens the narrowest layer looks back over; None: all of them."""
     config = model.config.get_text_config()
     if all(kind == "full_attention" for kind in getattr(config, "layer_types", None) or ["unknown"]):
@@ -68,7 +71,7 @@ def attention_window(model: Any) -> int | None:
     return min(sizes, default=None)
 
 
-def parameter_counts(model: Any, trained: Iterable[nn.Parameter]) -> tuple[int, int]:
+def parameter_counts(model: PreTrainedModel, trained: Iterable[nn.Parameter]) -> tuple[int, int]:
     """How many numbers are trained, and how many there are, the model's and those trained beside it."""
     trained = list(trained)
     every = {id(parameter): parameter for parameter in (*model.parameters(), *trained)}
@@ -76,7 +79,7 @@ def parameter_counts(model: Any, trained: Iterable[nn.Parameter]) -> tuple[int, 
 
 
 @torch.no_grad()
-def measure_factor(model: Any, base: nn.Module, head: nn.Linear) -> None:
+def measure_factor(model: PreTrainedModel, base: nn.Module, head: nn.Linear) -> None:
     """Check once, on a few tokens, that the model's logits are factor * head(base(tokens)), and store the
     factor on the head.
 
@@ -101,7 +104,7 @@ def measure_factor(model: Any, base: nn.Module, head: nn.Linear) -> None:
     setattr(head, FACTOR, factor)
 
 
-def _factor(model: Any, base: nn.Module, head: nn.Linear) -> float:
+def _factor(model: PreTrainedModel, base: nn.Module, head: nn.Linear) -> float:
     """What the model multiplies its head's output by, measured by replacing that output by known numbers."""
     reads: list[Tensor] = []
     given = torch.linspace(-SPAN, SPAN, head.out_features, device=head.weight.device)
@@ -143,5 +146,5 @@ def _seen(logits: Tensor, place: float) -> float:
     return float(logits[0, -1, round(place * (logits.shape[-1] - 1))])
 
 
-def _name(model: Any) -> str:
+def _name(model: PreTrainedModel) -> str:
     return f"{type(model).__name__} (model type {model.config.model_type})"

@@ -15,13 +15,16 @@ import stat
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from tightrope.language.model.architecture import parts
 from tightrope.runs.records import each_key_once
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedConfig, PreTrainedModel, PreTrainedTokenizerBase
 
 # every file of a model folder in which transformers looks for the names of code
 CONFIGS = ("config.json", "generation_config.json", "tokenizer_config.json", "processor_config.json")
@@ -61,7 +64,7 @@ def weights_fingerprint(folder: str) -> str | None:
     return digest.hexdigest() if files else None
 
 
-def load_tokenizer(folder: str) -> Any:
+def load_tokenizer(folder: str) -> PreTrainedTokenizerBase:
     """The tokenizer. Its padding settings are not used."""
     from transformers import AutoTokenizer
 
@@ -81,7 +84,7 @@ def load_causal(folder: str, dtype: torch.dtype = torch.float32) -> Any:
     return model
 
 
-def fused(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+def fused(make: Callable[..., Any], *arguments: object, **options: object) -> Any:
     """A model of `pretrained` or `without_weights`, with fused attention where its architecture has it. What
     its configuration chooses for attention is ignored: it may name a kernel to download.
     """
@@ -103,7 +106,7 @@ def without_dropout(model: nn.Module) -> None:
                 setattr(module, name, 0.0)
 
 
-def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
+def eos_ids(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
     """Every token that ends a response: those in the model's generation settings, else the tokenizer's.
 
     The tokenizer's own comes first: it is the one that training data is closed with.
@@ -119,7 +122,7 @@ def eos_ids(model: Any, tokenizer: Any) -> tuple[int, ...]:
     )
 
 
-def pretrained(kind: Any, folder: str | Path, **options: Any) -> Any:
+def pretrained(kind: Any, folder: str | Path, **options: object) -> Any:
     """``kind.from_pretrained(folder)`` for any of transformers' Auto classes: a folder or a hub id.
 
     Code of the folder is never run: trust_remote_code is off, and a model that names code is refused.
@@ -149,7 +152,7 @@ def pretrained(kind: Any, folder: str | Path, **options: Any) -> Any:
         ) from error
 
 
-def without_weights(kind: Any, config: Any, **options: Any) -> Any:
+def without_weights(kind: Any, config: PreTrainedConfig, **options: object) -> Any:
     """``kind.from_config(config)`` for any of transformers' Auto classes; no code of a folder is run.
     ValueError, with the reason, for a configuration of which no model can be built.
     """
@@ -198,7 +201,7 @@ def refuse_code(folder: str | Path) -> None:
         )
 
 
-def _names_code(value: Any) -> bool:
+def _names_code(value: object) -> bool:
     """Whether ``auto_map`` occurs anywhere in a configuration: the parts of a composite model have their
     own.
     """
@@ -260,12 +263,12 @@ def _refuse_links(path: Path) -> None:
             raise ValueError(f"{entry} is not a regular file. Take it out of the model's folder.")
 
 
-def _plain(name: Any) -> bool:
+def _plain(name: object) -> bool:
     """Whether this is the name of a file in the same folder."""
     return isinstance(name, str) and not set("/\\:") & set(name) and name not in ("", ".", "..")
 
 
-def _refuse_in_config(path: Path, value: Any, key: str = "") -> None:
+def _refuse_in_config(path: Path, value: object, key: str = "") -> None:
     """ValueError for what in a configuration could make transformers fetch code or open a file."""
     if isinstance(value, dict):
         for name, part in value.items():
@@ -302,7 +305,7 @@ def _refuse_size(path: Path, key: str, value: int) -> None:
         raise ValueError(f"{path}: {key} is {digits}; expected {low} to {high}. Choose another model.")
 
 
-def _refuse_file_names(path: Path, value: Any) -> None:
+def _refuse_file_names(path: Path, value: object) -> None:
     """ValueError for a file elsewhere in a tokenizer's configuration."""
     for key, part in value.items() if isinstance(value, dict) else ():
         names = part if isinstance(part, list) else [part]

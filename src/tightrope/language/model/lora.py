@@ -12,12 +12,15 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from tightrope.language.model.architecture import parts
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel
 
 
 class Switch:
@@ -97,7 +100,7 @@ def _is_linear(module: nn.Module) -> bool:
     return isinstance(module, nn.Linear) or type(module).__name__ == "Conv1D"  # transformers' own, in GPT-2
 
 
-def top_layers(model: Any, count: int | None) -> tuple[int, ...]:
+def top_layers(model: PreTrainedModel, count: int | None) -> tuple[int, ...]:
     """Indices of the ``count`` topmost decoder layers (None: all). ValueError: the model has fewer."""
     total = len(parts(model).layers)
     if count is not None and count > total:
@@ -140,7 +143,7 @@ def adapter_names(model: nn.Module) -> set[str]:
 
 
 @contextlib.contextmanager
-def using(model: Any, name: str | None) -> Iterator[None]:
+def using(model: PreTrainedModel, name: str | None) -> Iterator[None]:
     """Forward passes inside use this adapter (None: the bare trunk); nothing else changes."""
     switch = getattr(model, "adapter_switch", None)
     if switch is None:
@@ -156,7 +159,7 @@ def using(model: Any, name: str | None) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def folded(model: Any, name: str | None) -> Iterator[None]:
+def folded(model: PreTrainedModel, name: str | None) -> Iterator[None]:
     """`using`, for many passes between two updates: each weight and its adapter are added up once. No
     gradients.
     """
@@ -174,7 +177,7 @@ def folded(model: Any, name: str | None) -> Iterator[None]:
                     module.unfold()
 
 
-def checkpoint_activations(model: Any) -> None:
+def checkpoint_activations(model: PreTrainedModel) -> None:
     """Compute activations again in the backward pass, with the adapter that was on in the forward pass.
 
     transformers does so only in training mode; dropout is 0 everywhere.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -19,9 +19,12 @@ from tightrope.language.model.lora import (
 )
 from tightrope.runs.durable import atomic_folder, writing
 
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel, PreTrainedTokenizerBase
+
 
 def save_adapter(
-    model: Any, name: str, folder: Path, *, base_model: str, score: Tensor | None = None
+    model: PreTrainedModel, name: str, folder: Path, *, base_model: str, score: Tensor | None = None
 ) -> None:
     """Write an adapter as PEFT reads it: adapter_config.json and adapter_model.safetensors. With ``score``,
     a head [1, d], it is the adapter of a model that scores texts.
@@ -55,7 +58,7 @@ def save_adapter(
         (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
 
 
-def load_adapter(model: Any, name: str, folder: Path) -> None:
+def load_adapter(model: PreTrainedModel, name: str, folder: Path) -> None:
     """Add an adapter that `save_adapter` (or PEFT) wrote. ValueError when it does not fit the model."""
     config = read_object(folder / "adapter_config.json")
     rank, alpha, chosen = config.get("r"), config.get("lora_alpha"), config.get("layers_to_transform")
@@ -73,7 +76,13 @@ def load_adapter(model: Any, name: str, folder: Path) -> None:
     load_adapter_state(model, name, state)
 
 
-def save_model(model: Any, tokenizer: Any, run: Path, adapter: str | None, base_model: str) -> None:
+def save_model(
+    model: PreTrainedModel,
+    tokenizer: PreTrainedTokenizerBase,
+    run: Path,
+    adapter: str | None,
+    base_model: str,
+) -> None:
     """RUN/model for AutoModelForCausalLM.from_pretrained, tokenizer and chat template included. An adapter is
     folded in, and is also written to RUN/adapter for PEFT; ``base_model`` is the model it belongs to.
     """
@@ -83,7 +92,9 @@ def save_model(model: Any, tokenizer: Any, run: Path, adapter: str | None, base_
             save_adapter(model, adapter, folder, base_model=base_model)
 
 
-def write_model(model: Any, tokenizer: Any, folder: Path, adapter: str | None) -> None:
+def write_model(
+    model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase, folder: Path, adapter: str | None
+) -> None:
     """Any transformers model with one adapter folded in, and its tokenizer, as safetensors; whole or absent.
     Raises CannotWrite.
     """

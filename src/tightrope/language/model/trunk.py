@@ -10,7 +10,7 @@ import contextlib
 import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,9 @@ from torch import Tensor, nn
 from tightrope.language.data.batching import positions
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import WINDOW_FIELDS, parts
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel
 
 FINAL_NORMS = ("norm", "ln_f", "final_layer_norm")
 NARROW = 3  # tokens of a window while the halves are tried
@@ -31,7 +34,7 @@ class Trunk:
     Each layer keeps its own kind of attention.
     """
 
-    def __init__(self, model: Any, cut: int = 0, *, checkpointing: bool = False) -> None:
+    def __init__(self, model: PreTrainedModel, cut: int = 0, *, checkpointing: bool = False) -> None:
         self.model, self.parts = model, parts(model)
         self.cut = 0
         self._checkpointing = checkpointing
@@ -128,7 +131,7 @@ def _halves(base: nn.Module, layers: nn.ModuleList, cut: int) -> tuple[nn.Module
 
 
 @contextlib.contextmanager
-def _narrow_windows(config: Any) -> Iterator[None]:
+def _narrow_windows(config: object) -> Iterator[None]:
     """Inside, layers that look back over a window of tokens look over a narrow one."""
     before = {name: getattr(config, name, None) for name in WINDOW_FIELDS}
     for name, size in before.items():

@@ -13,7 +13,7 @@ import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
@@ -28,6 +28,9 @@ from tightrope.language.model.saving import load_adapter
 from tightrope.language.model.trunk import Role, Trunk
 from tightrope.language.settings import AlignSettings
 
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel, PreTrainedTokenizerBase
+
 
 @dataclass
 class Roles:
@@ -36,7 +39,7 @@ class Roles:
     ``critic``: None where its head reads the policy's hidden states, or where there is no critic.
     """
 
-    tokenizer: Any
+    tokenizer: PreTrainedTokenizerBase
     policy: Role
     reference: Role
     critic: Role | None
@@ -178,7 +181,7 @@ def _require_memory(
     require_memory(pretrained(AutoConfig, folder), job, settings.device, notify)
 
 
-def lowest_layer(model: Any, name: str) -> int:
+def lowest_layer(model: PreTrainedModel, name: str) -> int:
     """The index of the lowest decoder layer that an adapter changes."""
     for index, layer in enumerate(parts(model).layers):
         if name in lora.adapter_names(layer):

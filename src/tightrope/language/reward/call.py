@@ -77,7 +77,7 @@ class JobThread:
 
     def __init__(self, name: str, at_end: Callable[[], None] = lambda: None) -> None:
         self._name, self._at_end = name, at_end
-        self._jobs: queue.SimpleQueue[Any] | None = None
+        self._jobs: queue.SimpleQueue[tuple[Future[None], Callable[[], None]] | None] | None = None
 
     def run(self, work: Callable[[], None], timeout: float | None) -> None:
         """Wait until ``work()`` is done, at most ``timeout`` seconds, earlier work included.
@@ -96,7 +96,9 @@ class JobThread:
             future.result()
 
 
-def _serve(jobs: queue.SimpleQueue[Any], at_end: Callable[[], None]) -> None:
+def _serve(
+    jobs: queue.SimpleQueue[tuple[Future[None], Callable[[], None]] | None], at_end: Callable[[], None]
+) -> None:
     while (job := jobs.get()) is not None:
         future, work = job
         if future.set_running_or_notify_cancel():
@@ -121,7 +123,7 @@ class Caller:
         self._loop_worker = JobThread("async rewards", self._loop.close)
 
     def outcomes(
-        self, offered: dict[str, Any], completions: Sequence[Text], weights: Sequence[float]
+        self, offered: dict[str, object], completions: Sequence[Text], weights: Sequence[float]
     ) -> list[Outcome]:
         """Call the plain functions in order, then the async ones together.
 
@@ -149,17 +151,17 @@ class Caller:
 class _Call:
     """One function, called for one batch of ``count`` responses."""
 
-    def __init__(self, name: str, function: RewardFunction, offered: dict[str, Any], count: int) -> None:
+    def __init__(self, name: str, function: RewardFunction, offered: dict[str, object], count: int) -> None:
         self.name, self.function, self._count = name, function, count
         self._extras: dict[str, list[Any]] = {}
         self._metrics: dict[str, list[float]] = {}
-        self._back: list[Any] | BaseException | None = None  # what came back: None, as long as nothing has
+        self._back: list[object] | BaseException | None = None  # what came back: None, as long as nothing has
         self.late = False
         copies = {key: _copied(value) for key, value in offered.items()}
         copies |= {"log_extra": self._log_extra, "log_metric": self._log_metric}
         self._arguments = _accepted(name, function, copies)
 
-    def _log_extra(self, column: str, values: Sequence[Any]) -> None:
+    def _log_extra(self, column: str, values: Sequence[object]) -> None:
         """Add a column to the samples. ValueError unless there is one entry per response."""
         values = list(values)
         if len(values) != self._count:
@@ -193,7 +195,7 @@ class _Call:
                 raise
             self._keep(error)
 
-    def _keep(self, back: list[Any] | BaseException) -> None:
+    def _keep(self, back: list[object] | BaseException) -> None:
         if not self.late:  # a late call may return something when it is cancelled
             self._back = back
 
@@ -247,7 +249,7 @@ def is_async(function: RewardFunction) -> bool:
     )
 
 
-def as_number(value: Any) -> float | None:
+def as_number(value: object) -> float | None:
     """A score as a float, None for None. TypeError for what is not a real number.
 
     Whole numbers, truth values and scalars of numpy and torch are numbers; text is none, also "0.5".
@@ -283,7 +285,7 @@ def samples_text(samples: Sequence[int] | np.ndarray, completions: Sequence[Text
     return f"sample {samples[0]} of {len(completions)}{more} (response {shown})"
 
 
-def _read_scores(values: Sequence[Any], weight: float, scores: np.ndarray) -> dict[FaultKind, list[int]]:
+def _read_scores(values: Sequence[object], weight: float, scores: np.ndarray) -> dict[FaultKind, list[int]]:
     """Write the usable values into ``scores``; returns which are not, by the kind of fault."""
     bad: dict[FaultKind, list[int]] = {}
     for sample, value in enumerate(values):
@@ -301,7 +303,7 @@ def _read_scores(values: Sequence[Any], weight: float, scores: np.ndarray) -> di
     return bad
 
 
-def _accepted(name: str, function: RewardFunction, offered: dict[str, Any]) -> dict[str, Any]:
+def _accepted(name: str, function: RewardFunction, offered: dict[str, object]) -> dict[str, object]:
     """The arguments among those offered that the function's signature takes; all of them with ``**columns``.
 
     RewardError when it wants one that is not offered.
@@ -327,7 +329,7 @@ def _accepted(name: str, function: RewardFunction, offered: dict[str, Any]) -> d
     return {key: value for key, value in offered.items() if key in taken}
 
 
-def _as_list(result: Any, count: int) -> list[Any]:
+def _as_list(result: object, count: int) -> list[object]:
     """What a function returned, as a list of ``count`` entries that are not checked yet."""
     expected = f"expected a list of {count}, one number or None per response, in their order."
     if inspect.isawaitable(result):
@@ -347,7 +349,7 @@ def _as_list(result: Any, count: int) -> list[Any]:
     return values
 
 
-def _copied(value: Any) -> Any:
+def _copied(value: object) -> object:
     """Lists and the messages in them, copied; anything else as it is."""
     if type(value) is list:
         return [_copied(item) for item in value]

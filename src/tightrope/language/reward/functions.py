@@ -16,7 +16,7 @@ import itertools
 import math
 import re
 import sys
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -112,8 +112,8 @@ class Rewards:
         prompts: Sequence[Text],
         completions: Sequence[Text],
         completion_ids: Sequence[Sequence[int]],
-        columns: dict[str, list[Any]] | None = None,
-        trainer_state: Any = None,
+        columns: Mapping[str, Sequence[object]] | None = None,
+        trainer_state: object = None,
     ) -> Scores:
         """Score B responses. ``columns``: the data's other columns, B entries each.
 
@@ -188,7 +188,7 @@ class Rewards:
             )
 
 
-def checked_weight(weight: Any) -> float:
+def checked_weight(weight: object) -> float:
     """The weight as a float. ValueError for what is not a finite number."""
     value = None if isinstance(weight, str) else as_number(weight)
     if value is None or not math.isfinite(value):
@@ -218,7 +218,7 @@ def unique_name(taken: Container[str], word: str) -> str:
     return next(name for name in names if name not in taken)
 
 
-def length(completion_ids: list[list[int]], **_: Any) -> list[float]:
+def length(completion_ids: list[list[int]], **_: object) -> list[float]:
     """The reward for trying things out: tokens of each response."""
     return [float(len(ids)) for ids in completion_ids]
 

@@ -17,7 +17,7 @@ from tightrope.language.model import lora
 from tightrope.language.model.load import read_metadata, read_tensors, weights_fingerprint
 from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
-from tightrope.language.reward.call import Fault, RewardError
+from tightrope.language.reward.call import Fault, RewardError, RewardFunction
 from tightrope.language.reward.functions import (
     Rewards,
     Scores,
@@ -26,6 +26,13 @@ from tightrope.language.reward.functions import (
     unique_name,
 )
 from tightrope.language.reward.model import RewardModel, last_real, load_reward
+
+# What a user may give: a function, the words of the command line, or the folder of a reward model; alone or
+# with its weight, or several in a list.
+RewardSource = RewardFunction | str | Path
+RewardSources = (
+    RewardSource | tuple[RewardSource, float] | Sequence[RewardSource | tuple[RewardSource, float]]
+)
 
 
 class Judge:
@@ -46,7 +53,9 @@ class Judge:
         self.roles, self.functions, self.model, self.adapter = roles, functions, model, adapter
         self.weight = weight
 
-    def __call__(self, prompts: Sequence[Prompt], answers: Completions, trainer_state: Any = None) -> Scores:
+    def __call__(
+        self, prompts: Sequence[Prompt], answers: Completions, trainer_state: object = None
+    ) -> Scores:
         """Scores of the responses to ``prompts``, one prompt per response."""
         found = self._of_functions(prompts, answers, trainer_state)
         try:
@@ -63,10 +72,10 @@ class Judge:
         assert found is not None
         return found
 
-    def _of_functions(self, prompts: Sequence[Prompt], answers: Completions, state: Any) -> Scores | None:
+    def _of_functions(self, prompts: Sequence[Prompt], answers: Completions, state: object) -> Scores | None:
         if self.functions is None:
             return None
-        texts = [self.roles.tokenizer.decode(row, skip_special_tokens=True) for row in answers.ids]
+        texts = [str(self.roles.tokenizer.decode(row, skip_special_tokens=True)) for row in answers.ids]
         completions = [
             text if isinstance(prompt.shown, str) else [{"role": "assistant", "content": text}]
             for prompt, text in zip(prompts, texts, strict=True)
@@ -132,28 +141,30 @@ def with_model(found: Scores | None, learnt: np.ndarray, weight: float = 1.0) ->
 class GivenReward(NamedTuple):
     """One of the rewards that were given, its weight, and its folder where it is a reward model."""
 
-    given: Any
+    given: object
     weight: float
     folder: Path | None
 
 
-def _entries(reward: Any) -> list[GivenReward]:
+def _entries(reward: RewardSources) -> list[GivenReward]:
     """The rewards that were given: one, or a list. ValueError for a weight that is not a finite number."""
     found = []
     for given in reward if isinstance(reward, list) else [reward]:
-        pair = isinstance(given, tuple) and len(given) == 2
-        word, weight = (given[0], checked_weight(given[1])) if pair else (given, 1.0)
+        word: object = given
+        weight = 1.0
+        if isinstance(given, tuple) and len(given) == 2:
+            word, weight = given[0], checked_weight(given[1])
         folder = Path(word) if isinstance(word, str | Path) and Path(word).is_dir() else None
         found.append(GivenReward(word, weight, folder))
     return found
 
 
-def folder_of(reward: Any) -> Path | None:
+def folder_of(reward: RewardSources) -> Path | None:
     """The folder of a reward model, where a reward, or one of several, is one."""
     return next((entry.folder for entry in _entries(reward) if entry.folder is not None), None)
 
 
-def reward_adapter(reward: Any) -> Path | None:
+def reward_adapter(reward: RewardSources) -> Path | None:
     """The adapter folder of a reward model that was trained with LoRA, None for any other reward."""
     folders = [entry.folder / "adapter" for entry in _entries(reward) if entry.folder is not None]
     return next((folder for folder in folders if (folder / "head.safetensors").is_file()), None)
@@ -165,7 +176,7 @@ def shares_trunk(adapter: Path, model: str) -> bool:
     return bool(trained) and trained == weights_fingerprint(model)
 
 
-def make_judge(reward: Any, roles: Roles, *, on_trunk: Path | None, timeout: float | None) -> Judge:
+def make_judge(reward: RewardSources, roles: Roles, *, on_trunk: Path | None, timeout: float | None) -> Judge:
     """A judge from what the user gave: a function, (function, weight), words of the command line, or several.
 
     ``on_trunk``: the folder of the adapter that `make_roles` has put on the trunk.
@@ -214,7 +225,8 @@ def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:
     return head, float(tensors["shift"])
 
 
-def _same_tokens(model: RewardModel, roles: Roles, folder: Any) -> None:
+def _same_tokens(model: RewardModel, roles: Roles, folder: Path) -> None:
+    assert model.tokenizer is not None
     theirs, ours = model.tokenizer.get_vocab(), roles.tokenizer.get_vocab()
     if theirs != ours:
         raise ValueError(
@@ -223,7 +235,7 @@ def _same_tokens(model: RewardModel, roles: Roles, folder: Any) -> None:
         )
 
 
-def critic_from_reward(judge: Judge, roles: Roles, reward: Any) -> None:
+def critic_from_reward(judge: Judge, roles: Roles, reward: RewardSources) -> None:
     """Begin the critic with a reward model's weights: V = what its score adds to the reward at first.
 
     An adapter takes the reward model's adapter, a critic of its own the whole reward model; a head on the

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,9 @@ from tightrope.language.model.load import (
     without_dropout,
 )
 
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerBase
+
 SHIFT = "tightrope_reward_shift"  # in config.json: score = output of the head - shift
 
 
@@ -31,7 +34,9 @@ def last_real(hidden: Tensor, real: Tensor) -> Tensor:
 class RewardModel:
     """Scores of whole texts. ``base`` gives hidden states, ``head`` [1, d] their score, less ``shift``."""
 
-    def __init__(self, base: nn.Module, head: nn.Linear, shift: float, tokenizer: Any = None) -> None:
+    def __init__(
+        self, base: nn.Module, head: nn.Linear, shift: float, tokenizer: PreTrainedTokenizerBase | None = None
+    ) -> None:
         self.base, self.head, self.shift, self.tokenizer = base, head, shift, tokenizer
 
     def to(self, device: torch.device | str) -> RewardModel:

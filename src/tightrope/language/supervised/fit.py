@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -23,11 +23,11 @@ from torch import Tensor, nn
 from tightrope.algorithms.descent import CheckedSteps, MicroBatches
 from tightrope.algorithms.nonfinite import explain_loss
 from tightrope.algorithms.optimise import Adam
-from tightrope.language.data.examples import Item
+from tightrope.language.data.examples import Item, Rows
 from tightrope.language.model.architecture import parameter_counts
 from tightrope.language.model.load import quiet_libraries
 from tightrope.language.settings import SupervisedSettings, recorded
-from tightrope.language.supervised.prepare import Loaded, prepared
+from tightrope.language.supervised.prepare import GivenModel, Loaded, prepared
 from tightrope.runs import signals
 from tightrope.runs.checkpoint import counted, understood
 from tightrope.runs.folders import require_kind
@@ -227,7 +227,7 @@ def minibatches(
 
 def take_step(
     objective: Objective,
-    minibatch: Sequence[Any],
+    minibatch: Sequence[object],
     optimiser: torch.optim.Optimizer,
     checked: CheckedSteps,
     settings: SupervisedSettings,
@@ -274,15 +274,15 @@ class Stage(NamedTuple):
 
     name: str
     kind: type[SupervisedSettings]
-    objective: Callable[[Any, Loaded, dict[str, Any], Listeners], Objective]
+    objective: Callable[[Any, Loaded, Mapping[str, Rows | None], Listeners], Objective]
 
 
 @quiet_libraries()
 def train_stage(
     stage: Stage,
     settings: SupervisedSettings,
-    given: dict[str, Any],
-    model: tuple[Any, Any] | None,
+    given: Mapping[str, Rows | None],
+    model: GivenModel | None,
     listeners: Sequence[Listener],
     run_dir: str | Path | None,
 ) -> dict[str, Any]:
@@ -303,8 +303,8 @@ def train_stage(
 def resume_stage(
     stage: Stage,
     run_dir: str | Path,
-    given: dict[str, Any],
-    model: tuple[Any, Any] | None,
+    given: Mapping[str, Rows | None],
+    model: GivenModel | None,
     listeners: Sequence[Listener],
 ) -> dict[str, Any]:
     """Continue a run; returns the summary.
@@ -316,7 +316,7 @@ def resume_stage(
     with Run.open(run_dir, own=True) as run:
         require_kind(run.path, run.settings, stage.name)
         settings = stage.kind.from_json(run.settings, run.path / "settings.json")
-        objects = {**given, "model": model and model[0]}
+        objects: dict[str, object] = {**given, "model": model and model[0]}
         for name, value in objects.items():
             if value is None and str(run.settings.get(name)).startswith("<"):
                 word = shlex.quote(str(run_dir))

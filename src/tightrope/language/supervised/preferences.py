@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.data.batching import pad_right
-from tightrope.language.data.examples import Pair, preference_pairs, read_rows, sft_examples
+from tightrope.language.data.examples import Pair, Rows, preference_pairs, read_rows, sft_examples
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import parts
 from tightrope.language.model.load import weights_fingerprint, without_weights
@@ -27,7 +27,7 @@ from tightrope.language.model.saving import save_adapter
 from tightrope.language.reward.model import SHIFT, RewardModel
 from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised.fit import Objective, Stage, micro_batches, resume_stage, train_stage
-from tightrope.language.supervised.prepare import Loaded, examples_of, precision
+from tightrope.language.supervised.prepare import GivenModel, Loaded, examples_of, precision
 from tightrope.runs.durable import atomic_folder
 from tightrope.training.events import Listener, Listeners
 
@@ -107,10 +107,10 @@ def normalise(model: RewardModel, texts: Sequence[Sequence[int]], size: int) -> 
 def train_reward(
     settings: RewardSettings,
     *,
-    data: Any = None,
-    validation: Any = None,
-    demonstrations: Any = None,
-    model: tuple[Any, Any] | None = None,
+    data: Rows | None = None,
+    validation: Rows | None = None,
+    demonstrations: Rows | None = None,
+    model: GivenModel | None = None,
     listeners: Sequence[Listener] = (),
     run_dir: str | Path | None = None,
 ) -> dict[str, Any]:
@@ -131,10 +131,10 @@ def train_reward(
 def resume_reward(
     run_dir: str | Path,
     *,
-    data: Any = None,
-    validation: Any = None,
-    demonstrations: Any = None,
-    model: tuple[Any, Any] | None = None,
+    data: Rows | None = None,
+    validation: Rows | None = None,
+    demonstrations: Rows | None = None,
+    model: GivenModel | None = None,
     listeners: Sequence[Listener] = (),
 ) -> dict[str, Any]:
     """Continue a run of `train_reward`, as `resume_sft` does with one of `train_sft`."""
@@ -143,7 +143,7 @@ def resume_reward(
 
 
 def _objective(
-    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners
+    settings: RewardSettings, loaded: Loaded, given: Mapping[str, Rows | None], listeners: Listeners
 ) -> Objective:
     base, size = parts(loaded.model).base, settings.micro_batch_size or settings.minibatch_size
     head = make_head(loaded.model.config.hidden_size, settings.seed).to(settings.device)
@@ -193,7 +193,7 @@ REWARD_STAGE = Stage("reward", RewardSettings, _objective)
 
 
 def _data(
-    settings: RewardSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners
+    settings: RewardSettings, loaded: Loaded, given: Mapping[str, Rows | None], listeners: Listeners
 ) -> tuple[list[Pair], list[Pair], list[tuple[int, ...]]]:
     """Pairs to train on, pairs held out (whole prompts, where there are many), and texts to normalise on."""
     reading: dict[str, Any] = {"eos": loaded.eos, "max_tokens": settings.max_tokens, "notify": listeners.warn}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Hashable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import nn
 
-from tightrope.language.data.examples import Item, Row, hold_out, read_rows
+from tightrope.language.data.examples import Item, Row, Rows, hold_out, read_rows
 from tightrope.language.memory import job_of, require_memory
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import context_length
@@ -26,14 +26,21 @@ from tightrope.language.settings import SupervisedSettings
 from tightrope.runs import signals
 from tightrope.training.events import Listeners
 
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel, PreTrainedTokenizerBase
+
+
+# a model with its tokenizer, as a user may give them
+GivenModel = tuple["PreTrainedModel", "PreTrainedTokenizerBase"]
+
 
 class Loaded(NamedTuple):
     """A causal language model that is ready to train: its tokenizer, the folder or id it came from, the ids
     that end a response (the first closes texts), and the adapter that is trained (None: every weight).
     """
 
-    model: Any
-    tokenizer: Any
+    model: PreTrainedModel
+    tokenizer: PreTrainedTokenizerBase
     source: str
     eos: tuple[int, ...]
     adapter: str | None
@@ -47,7 +54,7 @@ class Loaded(NamedTuple):
 
 @contextlib.contextmanager
 def prepared(
-    settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None, listeners: Listeners
+    settings: SupervisedSettings, adapter: str, given: GivenModel | None, listeners: Listeners
 ) -> Iterator[Loaded]:
     """The model, ready to train inside. It is loaded when its memory was reported and fits; its adapter is
     active, and the settings' threads are used. ValueError for a device that is not there.
@@ -60,9 +67,7 @@ def prepared(
             yield loaded
 
 
-def _require_memory(
-    settings: SupervisedSettings, given: tuple[Any, Any] | None, listeners: Listeners
-) -> None:
+def _require_memory(settings: SupervisedSettings, given: GivenModel | None, listeners: Listeners) -> None:
     """Refuse a job that cannot fit; only the config is read. A model that is given and is on the device
     already needs no more room for its weights.
     """
@@ -75,9 +80,7 @@ def _require_memory(
     require_memory(config, job_of(settings), place, listeners.info, held)
 
 
-def load_for_training(
-    settings: SupervisedSettings, adapter: str, given: tuple[Any, Any] | None = None
-) -> Loaded:
+def load_for_training(settings: SupervisedSettings, adapter: str, given: GivenModel | None = None) -> Loaded:
     """Load the settings' model, or take a (model, tokenizer) that is given and train it in place.
 
     Tuned in full, the weights stay float32 with any ``dtype``: a step of 1e-5 is lost on a bfloat16
@@ -89,7 +92,8 @@ def load_for_training(
         source = find_model(settings.model)
         dtype = torch.float32 if settings.tune == "full" else getattr(torch, settings.dtype)
         given = load_causal(source, dtype), load_tokenizer(source)
-    model, tokenizer = given
+    model: Any = given[0]  # mypy cannot call the `to` of transformers
+    tokenizer = given[1]
     limit = context_length(model)
     if limit is not None and settings.max_tokens > limit:
         raise ValueError(
@@ -132,7 +136,7 @@ def threads(count: int | None) -> Iterator[None]:
 
 def examples_of(
     settings: SupervisedSettings,
-    given: dict[str, Any],
+    given: Mapping[str, Rows | None],
     read: Callable[[list[Row]], list[Item]],
     group: Callable[[Item], Hashable] | None = None,
 ) -> tuple[list[Item], list[Item]]:
@@ -144,7 +148,7 @@ def examples_of(
     if isinstance(source, str) and not source:
         raise ValueError("There is no data. Give --data FILE, or data= in Python.")
     examples = read(read_rows(source, settings.max_examples))
-    source = settings.validation if given["validation"] is None else given["validation"]
-    if source is not None:
-        return examples, read(read_rows(source))
+    validation = settings.validation if given["validation"] is None else given["validation"]
+    if validation is not None:
+        return examples, read(read_rows(validation))
     return hold_out(examples, settings.held_out, settings.seed, group)

@@ -5,27 +5,30 @@ L = - sum over learnt tokens of log p(token | the tokens before it) / their numb
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from tightrope.language.data.batching import Example, Packed, attention_of, collate, pack_rows, row_of
-from tightrope.language.data.examples import Row, sft_examples
+from tightrope.language.data.examples import Row, Rows, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.model.architecture import attention_window, parts
 from tightrope.language.model.saving import save_model
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, Stage, micro_batches, resume_stage, train_stage
-from tightrope.language.supervised.prepare import Loaded, examples_of, precision
+from tightrope.language.supervised.prepare import GivenModel, Loaded, examples_of, precision
 from tightrope.training.events import Listener, Listeners
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel
 
 PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
 
 
-def hidden_states(model: Any, rows: Packed) -> Tensor:
+def hidden_states(model: PreTrainedModel, rows: Packed) -> Tensor:
     """Hidden states [B, N, d] of right-padded rows; no text sees padding, or another text of its row."""
     base = parts(model).base
     if not bool((rows.segments > 0).any()):
@@ -40,7 +43,7 @@ def hidden_states(model: Any, rows: Packed) -> Tensor:
 
 
 @torch.no_grad()
-def require_packable(model: Any, longest: int) -> None:
+def require_packable(model: PreTrainedModel, longest: int) -> None:
     """ValueError for a model whose loss would not be the same when texts share a row of ``longest`` tokens:
     its attention has a shorter window, or it reads attention masks differently.
     """
@@ -65,7 +68,7 @@ def require_packable(model: Any, longest: int) -> None:
         )
 
 
-def token_loss(model: Any, rows: Packed) -> Tensor:
+def token_loss(model: PreTrainedModel, rows: Packed) -> Tensor:
     """-log p summed over the learnt tokens, a scalar in nats; divide by ``rows.learn.sum()`` for the mean."""
     head, targets = parts(model).head, rows.learn[:, 1:]
     hidden = hidden_states(model, rows)[:, :-1][targets].to(head.weight.dtype)
@@ -74,7 +77,7 @@ def token_loss(model: Any, rows: Packed) -> Tensor:
 
 
 @torch.no_grad()
-def mean_loss(model: Any, rows: Sequence[Packed], size: int) -> float:
+def mean_loss(model: PreTrainedModel, rows: Sequence[Packed], size: int) -> float:
     """The mean loss per learnt token over all rows, ``size`` rows at a time; nats."""
     total, count = 0.0, 0
     for part in micro_batches(rows, size, len):
@@ -86,9 +89,9 @@ def mean_loss(model: Any, rows: Sequence[Packed], size: int) -> float:
 def train_sft(
     settings: SFTSettings,
     *,
-    data: Any = None,
-    validation: Any = None,
-    model: tuple[Any, Any] | None = None,
+    data: Rows | None = None,
+    validation: Rows | None = None,
+    model: GivenModel | None = None,
     listeners: Sequence[Listener] = (),
     run_dir: str | Path | None = None,
 ) -> dict[str, Any]:
@@ -108,9 +111,9 @@ def train_sft(
 def resume_sft(
     run_dir: str | Path,
     *,
-    data: Any = None,
-    validation: Any = None,
-    model: tuple[Any, Any] | None = None,
+    data: Rows | None = None,
+    validation: Rows | None = None,
+    model: GivenModel | None = None,
     listeners: Sequence[Listener] = (),
 ) -> dict[str, Any]:
     """Continue a run from its newest checkpoint, or from its beginning where there is none yet. It ends like
@@ -123,7 +126,7 @@ def resume_sft(
 
 
 def _objective(
-    settings: SFTSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners
+    settings: SFTSettings, loaded: Loaded, given: Mapping[str, Rows | None], listeners: Listeners
 ) -> Objective:
     model, size = loaded.model, settings.micro_batch_size or settings.minibatch_size
     rows, held = _rows(settings, loaded, given, listeners)
@@ -157,7 +160,7 @@ def _learnt(row: Packed) -> int:
 
 
 def _rows(
-    settings: SFTSettings, loaded: Loaded, given: dict[str, Any], listeners: Listeners
+    settings: SFTSettings, loaded: Loaded, given: Mapping[str, Rows | None], listeners: Listeners
 ) -> tuple[list[Packed], list[Packed]]:
     """The rows to train on and those held out; packed apart, so that nothing held out is trained on."""
 
