@@ -7,7 +7,7 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -31,9 +31,10 @@ from tightrope.control.environments.base import Environments
 from tightrope.control.environments.faults import FailedEpisode, policy_of, require_finite
 from tightrope.control.environments.make import make_environments
 from tightrope.control.environments.processes import available_cores
+from tightrope.control.environments.tasks import EnvSource
 from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.policy.normalise import Normalisers
-from tightrope.control.policy.policy import Policy
+from tightrope.control.policy.policy import OwnPolicy, Policy
 from tightrope.control.resolve import anywhere, require_room, resolve, resolved, without_effect
 from tightrope.control.rollout.collector import Collector
 from tightrope.control.rollout.replay import Before, begin
@@ -64,12 +65,12 @@ class Agent:
 
     def __init__(
         self,
-        env: Any,
+        env: EnvSource,
         *,
-        policy: Any = None,
+        policy: OwnPolicy | None = None,
         settings: TrainSettings | None = None,
         notify: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
-        **values: Any,
+        **values: object,
     ) -> None:
         self.settings = settings or resolve(env, self.algorithm, values)
         self.env = env
@@ -275,7 +276,7 @@ class Agent:
     # ------------------------------------------------------------------------------------------------ acting
 
     def predict(
-        self, observation: Any, deterministic: bool = True, *, action_masks: Any = None
+        self, observation: object, deterministic: bool = True, *, action_masks: object = None
     ) -> tuple[Any, None]:
         """Action(s) for one observation or a batch, in the task's own form; the second item is always None.
 
@@ -289,7 +290,7 @@ class Agent:
         matrix = self.choose(inputs, action_mask, None if deterministic else self.predict_rng)
         return (actions.to_env(matrix) if batched else actions.to_env_single(matrix[0])), None
 
-    def value(self, observation: Any) -> Any:
+    def value(self, observation: object) -> Any:
         """The critic's V(s) in units of the return: a float for one observation, an array [N] for a batch."""
         layout = self.environments.observation_layout
         batched = layout.is_batched(observation)
@@ -317,7 +318,7 @@ class Agent:
 
     # ------------------------------------------------------------------------------------- moving and saving
 
-    def set_env(self, env: Any) -> Agent:
+    def set_env(self, env: EnvSource) -> Agent:
         """Continue on another environment with the same spaces (a warm start); bounds of observations, which
         no network sees, may be others.
 
@@ -388,7 +389,7 @@ class Agent:
             "action bounds": bounds_of(environments.action_layout.space),
         }
 
-    def require_spaces(self, state: dict[str, Any]) -> None:
+    def require_spaces(self, state: Mapping[str, object]) -> None:
         """ValueError when a saved policy was trained on other observations or actions than there are here."""
         saved = state.get("spaces")  # missing in old runs
         for name, here in self._spaces().items():
@@ -474,7 +475,7 @@ class Reinforce(Agent):
 AGENTS: dict[str, type[Agent]] = {"ppo": PPO, "a2c": A2C, "reinforce": Reinforce}
 
 
-def _environments(env: Any, settings: TrainSettings) -> Environments:
+def _environments(env: EnvSource | None, settings: TrainSettings) -> Environments:
     source = settings.env if env is None else env
     backend, workers, policy = settings.vector_backend, settings.num_workers, policy_of(settings)
     return make_environments(

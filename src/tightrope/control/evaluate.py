@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tightrope.control.environments.tasks import EnvSource
+from tightrope.control.policy.policy import OwnPolicy
 from tightrope.control.rollout.evaluation import (
     cut_text,
     evaluate_agent,
@@ -25,9 +27,9 @@ def evaluate_run(
     stochastic: bool = False,
     best: bool = False,
     seed: int | None = None,
-    env: Any = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    policy: Any = None,
+    env: EnvSource | None = None,
+    env_kwargs: Mapping[str, object] | None = None,
+    policy: OwnPolicy | None = None,
     device: str = "cpu",
     evaluation_max_steps: int | None = None,
 ) -> dict[str, Any]:
@@ -36,8 +38,9 @@ def evaluate_run(
     ``max_steps`` in the result: where an episode is cut, None where nothing cuts it; ``evaluation_max_steps``
     None: as in training.
     """
-    task = {"env": env, "env_kwargs": env_kwargs}
-    agent = load(path, **task, policy=policy, best=best, device=device, engine="torch")  # nothing is learnt
+    agent = load(
+        path, env=env, env_kwargs=env_kwargs, policy=policy, best=best, device=device, engine="torch"
+    )  # nothing is learnt
     try:
         environments = evaluation_environments(agent.env, agent.settings, episodes)
         seed = EVALUATION_SEED if seed is None else seed

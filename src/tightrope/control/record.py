@@ -15,6 +15,8 @@ import numpy as np
 
 from tightrope.control.environments import tasks
 from tightrope.control.environments.masks import find_source
+from tightrope.control.environments.tasks import EnvSource
+from tightrope.control.policy.policy import OwnPolicy
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 
 if TYPE_CHECKING:
@@ -31,9 +33,9 @@ def record_run(
     best: bool = False,
     episodes: int = 1,
     seed: int | None = None,
-    env: Any = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    policy: Any = None,
+    env: EnvSource | None = None,
+    env_kwargs: Mapping[str, object] | None = None,
+    policy: OwnPolicy | None = None,
 ) -> dict[str, Any]:
     """Record ``episodes`` deterministic episodes of a run or saved folder; gives path, frames, returns.
 
@@ -79,7 +81,7 @@ def _headless() -> Iterator[None]:
             os.environ.pop(name, None)
 
 
-def _renderable(env: Any, settings: TrainSettings) -> gym.Env:
+def _renderable(env: EnvSource, settings: TrainSettings) -> gym.Env:
     """A fresh environment that renders to arrays."""
     name, keywords = settings.env, settings.env_kwargs or {}
     if isinstance(env, str) and env.startswith("ALE/"):

@@ -14,6 +14,7 @@ from tightrope.runs import signals
 
 if TYPE_CHECKING:
     from tightrope.control.environments.base import Environments
+    from tightrope.control.environments.tasks import EnvSource
     from tightrope.control.spaces.actions import ActionLayout
     from tightrope.control.spaces.observations import ObservationLayout
 
@@ -22,7 +23,7 @@ STEP_BYTES = 48  # of a step beside its observation and action: rewards, values,
 DESCRIBE = ("encoder", "env_kwargs", "observation_keys", "vector_backend", "env_timeout")
 
 
-def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None = None) -> TrainSettings:
+def resolve(env: EnvSource, algorithm: str = "ppo", overrides: dict[str, Any] | None = None) -> TrainSettings:
     """The settings for a task (a Gymnasium id, an environment, a factory or a vector environment).
 
     Raises ValueError for values out of range and for names that the algorithm does not know.
@@ -31,7 +32,7 @@ def resolve(env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None =
 
 
 def resolve_with_preset(
-    env: Any, algorithm: str = "ppo", overrides: dict[str, Any] | None = None
+    env: EnvSource, algorithm: str = "ppo", overrides: dict[str, Any] | None = None
 ) -> tuple[TrainSettings, dict[str, Any]]:
     """The settings as `resolve` gives them, and what the task's preset would set where nothing is given."""
     from tightrope.control.environments.tasks import name_of, time_limit
@@ -59,7 +60,7 @@ def resolve_with_preset(
     return settings, chosen
 
 
-def anywhere(settings: TrainSettings, env: Any, **values: Any) -> TrainSettings:
+def anywhere(settings: TrainSettings, env: EnvSource, **values: Any) -> TrainSettings:
     """The settings for another environment: who steps it is chosen again, and what was built with the
     arguments of the old one is not built with them.
     """
@@ -70,7 +71,7 @@ def anywhere(settings: TrainSettings, env: Any, **values: Any) -> TrainSettings:
     return dataclasses.replace(settings, vector_backend="auto", num_workers=None, env_kwargs=kept, **values)
 
 
-def _describe(env: Any, values: dict[str, Any]) -> tuple[str, int | None]:
+def _describe(env: EnvSource, values: dict[str, Any]) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
     from tightrope.control.environments.copies import makers_of
     from tightrope.control.environments.tasks import (
@@ -95,7 +96,7 @@ def _describe(env: Any, values: dict[str, Any]) -> tuple[str, int | None]:
             make_all(makers_of(env, 1, given.env_kwargs), made, limit=limit)
         if made and made[0] is not env:
             stack.callback(close_environment, made[0], 0, limit)
-        task = made[0] if made else env
+        task: Any = made[0] if made else env
         vector = hasattr(task, "single_observation_space")
         space = task.single_observation_space if vector else task.observation_space
         observations = observation_layout(space, given.encoder, given.observation_keys)

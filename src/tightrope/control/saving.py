@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.control.agent import AGENTS, Agent
+from tightrope.control.environments.tasks import EnvSource
 from tightrope.control.environments.vector import is_vector_env
+from tightrope.control.policy.policy import OwnPolicy
 from tightrope.control.resolve import anywhere
 from tightrope.control.settings import TrainSettings
 from tightrope.runs import checkpoint
@@ -21,9 +23,9 @@ from tightrope.runs.retention import Checkpoint
 def load(
     path: str | Path,
     *,
-    env: Any = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    policy: Any = None,
+    env: EnvSource | None = None,
+    env_kwargs: Mapping[str, object] | None = None,
+    policy: OwnPolicy | None = None,
     best: bool = False,
     device: str | None = None,
     engine: str | None = None,
@@ -80,7 +82,7 @@ def name_again(path: str | Path, env: str, command: str) -> str:
 
 
 def rebuild(
-    env: Any, path: str | Path, *, settings: TrainSettings, command: str = "evaluate", **more: Any
+    env: EnvSource, path: str | Path, *, settings: TrainSettings, command: str = "evaluate", **more: Any
 ) -> Agent:
     """An agent for saved settings; a task that is not registered (any more) is answered with what to type."""
     try:

@@ -187,7 +187,7 @@ class TrainSettings(Settings):
             )
 
     @classmethod
-    def values_from_json(cls, data: Any, source: object = "settings.json") -> dict[str, Any]:
+    def values_from_json(cls, data: object, source: object = "settings.json") -> dict[str, Any]:
         """See Settings. ``squash``, the setting before ``action_bounds``, is translated."""
         if isinstance(data, dict) and isinstance(data.get("squash"), bool):
             kept = {name: value for name, value in data.items() if name != "squash"}

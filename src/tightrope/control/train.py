@@ -11,6 +11,8 @@ from typing import Any
 from tightrope.control.agent import AGENTS, Agent
 from tightrope.control.environments.faults import EnvironmentFault, FailedEpisode
 from tightrope.control.environments.make import Environments
+from tightrope.control.environments.tasks import EnvSource
+from tightrope.control.policy.policy import OwnPolicy
 from tightrope.control.repetition import Repetition
 from tightrope.control.resolve import resolve, without_effect
 from tightrope.control.rollout.collector import BadNumbers
@@ -45,8 +47,8 @@ def train(
     *,
     run_dir: str | Path | None = None,
     listeners: Sequence[Listener] = (),
-    env: Any = None,
-    policy: Any = None,
+    env: EnvSource | None = None,
+    policy: OwnPolicy | None = None,
 ) -> dict[str, Any]:
     """Train from the start; returns the summary that is also written to the run folder."""
     home, report = Path.cwd(), Listeners(listeners)
@@ -77,8 +79,8 @@ def resume(
     *,
     total_steps: int | None = None,
     listeners: Sequence[Listener] = (),
-    env: Any = None,
-    policy: Any = None,
+    env: EnvSource | None = None,
+    policy: OwnPolicy | None = None,
 ) -> dict[str, Any]:
     """Continue from the newest checkpoint, or from the start where there is none yet; the end is that of an
     uninterrupted run, bit for bit (docs/resume.md names the conditions).
@@ -89,7 +91,9 @@ def resume(
         return _resume(run, total_steps, Listeners(listeners), env, policy)
 
 
-def _resume(run: Run, total_steps: int | None, listeners: Listeners, env: Any, policy: Any) -> dict[str, Any]:
+def _resume(
+    run: Run, total_steps: int | None, listeners: Listeners, env: EnvSource | None, policy: OwnPolicy | None
+) -> dict[str, Any]:
     run_dir = run.path
     require_kind(run_dir, run.settings, "train")
     point = newest_point(run, listeners)

@@ -23,7 +23,7 @@ import gymnasium as gym
 import numpy as np
 
 from tightrope.control.environments.state import nested
-from tightrope.control.environments.tasks import make_by_id, require_keywords, without_noise
+from tightrope.control.environments.tasks import EnvSource, make_by_id, require_keywords, without_noise
 
 # wrappers that gym.make adds or not, without effect on a task
 BOOKKEEPING = ("OrderEnforcing", "PassiveEnvChecker")
@@ -44,7 +44,7 @@ Maker = Callable[[], gym.Env]
 Found = dict[str, tuple[Any, Any]]
 
 
-def makers_of(env: Any, num_envs: int, keywords: Mapping[str, Any] | None = None) -> list[Maker]:
+def makers_of(env: EnvSource, num_envs: int, keywords: Mapping[str, object] | None = None) -> list[Maker]:
     """One function per copy of an id, an instance (it is copy 0 itself) or a factory.
 
     ``keywords``: for the constructor. ValueError: something else, or keywords that cannot be given.
@@ -194,7 +194,7 @@ def _why_no_copy(env: gym.Env, kept: gym.Env, alike: bool, changed: Found) -> st
     return None
 
 
-def _holds(value: Any, env: gym.Env) -> bool:
+def _holds(value: object, env: gym.Env) -> bool:
     """Whether a function reaches into an environment, to which it then belongs also where it was copied."""
     inside = [cell.cell_contents for cell in getattr(value, "__closure__", None) or ()]
     owners = [getattr(x, "__self__", x) for x in inside]
@@ -244,7 +244,7 @@ def _words(found: Found) -> str:
     return ", ".join(shown) + (f" and {more} more" if more else "")
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = " ".join(str(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -290,7 +290,7 @@ def differences(one: gym.Env, other: gym.Env) -> Found:
     return found
 
 
-def _compared(a: Any, b: Any, place: str = "", *, attributes: bool = False) -> Found:
+def _compared(a: object, b: object, place: str = "", *, attributes: bool = False) -> Found:
     """The places in which two values differ, those nearest to the top first."""
     found: Found = {}
     seen: dict[tuple[int, int], tuple[Any, Any]] = {}  # holds the values: an id must not be used again
@@ -309,7 +309,7 @@ def _compared(a: Any, b: Any, place: str = "", *, attributes: bool = False) -> F
     return found
 
 
-def _parts(place: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]] | None:
+def _parts(place: str, a: object, b: object) -> Iterator[tuple[str, Any, Any]] | None:
     """What is to be compared inside two values: nothing where they are equal or opaque; None: they differ."""
     nothing: Iterator[tuple[str, Any, Any]] = iter(())
     if isinstance(a, PLAIN) and isinstance(b, PLAIN):
@@ -346,7 +346,7 @@ def _members(a: Any, b: Any, place: str, attributes: bool) -> Iterator[tuple[str
     yield f"{place}[...]", mine, his
 
 
-def _parts_of_code(place: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]] | None:
+def _parts_of_code(place: str, a: object, b: object) -> Iterator[tuple[str, Any, Any]] | None:
     """Functions are equal when their code and what they close over are; classes and modules by their name."""
     if isinstance(a, types.MethodType) and isinstance(b, types.MethodType):
         return iter(
@@ -362,14 +362,14 @@ def _parts_of_code(place: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]
     return iter(parts)
 
 
-def _name_of_type(value: Any) -> str:
+def _name_of_type(value: object) -> str:
     named = value if isinstance(value, CODE) else type(value)
     return (
         f"{getattr(named, '__module__', '')}.{getattr(named, '__qualname__', getattr(named, '__name__', ''))}"
     )
 
 
-def _inside(value: Any) -> Mapping[str, Any] | None:
+def _inside(value: object) -> Mapping[str, Any] | None:
     """The values that make up an object: its attributes, else what it would pickle; None: neither."""
     if isinstance(value, PLAIN + CODE) or _is_array(value):
         return {"value": value}
@@ -391,7 +391,7 @@ def _inside(value: Any) -> Mapping[str, Any] | None:
     return {CONTENT: reduced[1:3]} if isinstance(reduced, tuple) else None
 
 
-def _attributes(value: Any) -> dict[str, Any]:
+def _attributes(value: object) -> dict[str, Any]:
     """The attributes of an object, in ``__dict__`` and in ``__slots__``."""
     found = dict(getattr(value, "__dict__", {}))
     for kind in type(value).__mro__:
@@ -402,11 +402,11 @@ def _attributes(value: Any) -> dict[str, Any]:
     return found
 
 
-def _is_array(value: Any) -> bool:
+def _is_array(value: object) -> bool:
     return hasattr(type(value), "__array__") and not isinstance(value, np.generic)
 
 
-def _equal_arrays(a: Any, b: Any) -> bool:
+def _equal_arrays(a: object, b: object) -> bool:
     try:
         x, y = np.asarray(a), np.asarray(b)
     except Exception:  # on a device, say
@@ -418,5 +418,5 @@ def _equal_arrays(a: Any, b: Any) -> bool:
     return bool(((x == y) | ((x != x) & (y != y))).all())
 
 
-def _equal(a: Any, b: Any) -> bool:
+def _equal(a: object, b: object) -> bool:
     return bool(a == b) or bool(a != a and b != b)

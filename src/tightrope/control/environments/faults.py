@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tightrope.errors import TightropeError
 from tightrope.runs import signals
@@ -212,7 +213,7 @@ def circumstances(worker: int, seed: int | None, action: str | None) -> str:
     return f" ({who}, seed {seed}, {'no action yet' if action is None else f'last action {action}'})"
 
 
-def action_text(action: Any) -> str:
+def action_text(action: object) -> str:
     """An action in at most 80 characters."""
     text = " ".join(str(action).split())
     return text if len(text) <= 80 else f"{text[:77]}..."
@@ -225,7 +226,7 @@ def raised_here(error: BaseException) -> bool:
     return bool(frames) and control in Path(frames[-1].filename).parents
 
 
-def kind_of(value: Any) -> str:
+def kind_of(value: object) -> str:
     """A value in a few words for an error message."""
     if isinstance(value, tuple):
         return f"a tuple of {len(value)} values"
@@ -242,7 +243,7 @@ def float_parts(inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
     return [x.reshape(len(x), math.prod(x.shape[1:])) for x in inputs.values() if x.dtype.kind == "f"]
 
 
-def first_unusable(numbers: Any) -> tuple[int, ...] | None:
+def first_unusable(numbers: ArrayLike) -> tuple[int, ...] | None:
     """The index of the first number that is NaN, infinite or beyond float32, in which the networks learn;
     None when every number can be used.
     """
@@ -250,7 +251,7 @@ def first_unusable(numbers: Any) -> tuple[int, ...] | None:
     return None if good.all() else tuple(int(i) for i in np.argwhere(~good)[0])
 
 
-def require_finite(inputs: dict[str, Any]) -> dict[str, Any]:
+def require_finite(inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The inputs as they are. ValueError for a NaN or an infinity, from which any action could follow."""
     for numbers in float_parts(inputs):
         found = first_unusable(numbers)
@@ -263,7 +264,7 @@ def require_finite(inputs: dict[str, Any]) -> dict[str, Any]:
     return inputs
 
 
-def check_finite(what: str, numbers: Any) -> None:
+def check_finite(what: str, numbers: ArrayLike) -> None:
     """ApiBreak for the first number that cannot be used (see `first_unusable`)."""
     index = first_unusable(numbers)
     if index is not None:

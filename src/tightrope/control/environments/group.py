@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -92,7 +92,7 @@ class StepBuffers:
     def map(self, function: Callable[[Any], Any]) -> StepBuffers:
         """The same buffers with ``function`` applied to each array."""
 
-        def mapped(value: Any) -> Any:
+        def mapped(value: object) -> Any:
             if isinstance(value, dict):
                 return {name: function(array) for name, array in value.items()}
             return function(value)
@@ -263,7 +263,7 @@ class EnvGroup:
         episode, after, _ = self.buffers.origins[row].tolist()
         return int(episode + after + 1)
 
-    def _step_from(self, begin: int, actions: Iterator[Any]) -> int:
+    def _step_from(self, begin: int, actions: Iterator[object]) -> int:
         """Step from row ``begin`` on; the row to continue from, behind one that was restarted."""
         # local names are faster, and this loop runs at every step
         buffers, plain, shape, checked = self.buffers, self._plain, self._shape, self._checked
@@ -316,7 +316,7 @@ class EnvGroup:
         return self._dtype
 
     def _end(
-        self, row: int, observation: Any, terminated: bool, info: dict[str, Any]
+        self, row: int, observation: object, terminated: bool, info: dict[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """Record how the episode ended, keep a truncation's last observation, and reset."""
         self._dirty = True
@@ -342,7 +342,7 @@ class EnvGroup:
 
     # ------------------------------------------------------------------------------------------------- masks
 
-    def _find_mask(self, row: int, info: dict[str, Any]) -> None:
+    def _find_mask(self, row: int, info: Mapping[str, object]) -> None:
         source = find_source(
             self.envs[row], info, self.observation_layout.has_mask, self.action_layout.num_logits
         )
@@ -354,7 +354,7 @@ class EnvGroup:
                 f"{self._mask_sources[0].kind!r}"
             )
 
-    def _store_mask(self, row: int, observation: Any, info: dict[str, Any]) -> None:
+    def _store_mask(self, row: int, observation: object, info: Mapping[str, object]) -> None:
         mask = self._mask_sources[row].read(observation, info)
         self.buffers.masks[row] = self.action_layout.flatten_mask(mask, 1)
 
@@ -426,7 +426,7 @@ class _Waiting:
     def __init__(self, envs: list[Any], row: int, reset: tuple[Any, dict[str, Any]], steps: int) -> None:
         self.env, self._envs, self._row, self._reset, self._left = envs[row], envs, row, reset, steps
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if not self._left:
             self._envs[self._row] = self.env
             return self.env.step(action)
@@ -437,7 +437,7 @@ class _Waiting:
         self.env.close()
 
 
-def _awake(env: Any) -> Any:
+def _awake(env: object) -> Any:
     return env.env if isinstance(env, _Waiting) else env
 
 
@@ -453,7 +453,7 @@ def check_alike(
             )
 
 
-def _check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
+def _check_reset(result: object) -> tuple[Any, dict[str, Any]]:
     """The pair (observation, info) that ``reset`` returned; ApiBreak when it is something else."""
     if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
         raise ApiBreak(
@@ -463,7 +463,7 @@ def _check_reset(result: Any) -> tuple[Any, dict[str, Any]]:
     return result
 
 
-def _check_step(result: Any, has_masks: bool) -> None:
+def _check_step(result: object, has_masks: bool) -> None:
     """Check a step of an environment. ApiBreak when it does not follow Gymnasium's API."""
     if not isinstance(result, tuple) or len(result) != 5:
         raise ApiBreak(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import gymnasium as gym
 
@@ -32,7 +32,7 @@ class Backend(NamedTuple):
     num_workers: int = 1
 
 
-def look_first(env_id: str, keywords: Mapping[str, Any] | None = None) -> None:
+def look_first(env_id: str, keywords: Mapping[str, object] | None = None) -> None:
     """EnvironmentFault for an id of an unknown package whose environment ends its process; see
     `first_look`."""
     if not tasks.entry_module(tasks.find_spec(env_id)).startswith(KNOWN_MODULES):
@@ -61,12 +61,12 @@ def choose_backend(
 
 
 def make_environments(
-    env: str | gym.Env | Callable[[], gym.Env] | gym.vector.VectorEnv,
+    env: tasks.EnvSource,
     num_envs: int | None = None,
     *,
     backend: str = "auto",
     num_workers: int | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
+    env_kwargs: Mapping[str, object] | None = None,
     policy: FaultPolicy = FaultPolicy(),  # noqa: B008 - it cannot be changed
     reading: Reading = Reading(),  # noqa: B008
     reseed_after: int | None = None,
@@ -132,7 +132,7 @@ def _require_layers(names: list[str], layers: int) -> None:
             )
 
 
-def _resolve(env: Any, num_envs: int, backend: str, num_workers: int | None) -> Backend:
+def _resolve(env: tasks.EnvSource, num_envs: int, backend: str, num_workers: int | None) -> Backend:
     """The backend to use: the one asked for where it is possible, else ``choose_backend``'s."""
     cores = available_cores()
     if backend in ("vector", "envpool"):
@@ -158,7 +158,7 @@ def _vector_version(
     env_id: str,
     num_envs: int,
     backend: str,
-    keywords: Mapping[str, Any] | None,
+    keywords: Mapping[str, object] | None,
     policy: FaultPolicy,
     reading: Reading,
 ) -> VectorEnvironments:
@@ -176,7 +176,7 @@ def _vector_version(
 
 
 def _given(
-    env: Any, num_envs: int | None, backend: str, policy: FaultPolicy, reading: Reading
+    env: gym.vector.VectorEnv, num_envs: int | None, backend: str, policy: FaultPolicy, reading: Reading
 ) -> VectorEnvironments:
     """A vector environment that the user gave as an object."""
     if num_envs not in (None, int(env.num_envs)):

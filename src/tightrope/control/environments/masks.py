@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -31,7 +31,7 @@ class MaskSource:
     kind: Literal["none", "info", "method", "observation"] = "none"
     method: Callable[[], Any] | None = None
 
-    def read(self, observation: Any, info: dict[str, Any]) -> Any:
+    def read(self, observation: Any, info: Mapping[str, object]) -> Any:
         """The mask as the environment gives it; None without any. ApiBreak: it is missing from the info."""
         if self.kind == "info":
             if MASK_KEY not in info:
@@ -43,7 +43,9 @@ class MaskSource:
         return observation[MASK_KEY] if self.kind == "observation" else None
 
 
-def find_source(env: Any, info: dict[str, Any], observed: bool, num_logits: int) -> MaskSource:
+def find_source(
+    env: gym.Env | gym.vector.VectorEnv, info: Mapping[str, object], observed: bool, num_logits: int
+) -> MaskSource:
     """The source of the masks of a single or a vector environment whose reset returned ``info``.
 
     ``observed``: a Dict observation has one; ``num_logits``: choices of the actions that a mask could forbid.

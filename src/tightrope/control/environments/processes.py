@@ -24,8 +24,10 @@ from collections.abc import Callable, Sequence
 from multiprocessing.context import BaseContext
 from typing import Any, NoReturn
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
+from numpy.typing import DTypeLike
 
 from tightrope.control.environments.faults import RAISED, EnvironmentFault, FaultPolicy
 from tightrope.runs.durable import spare_standard_streams
@@ -55,7 +57,7 @@ def available_cores() -> int:
 class SharedArray:
     """A numpy array in shared memory that can travel to a worker when it starts."""
 
-    def __init__(self, context: BaseContext, shape: tuple[int, ...], dtype: Any) -> None:
+    def __init__(self, context: BaseContext, shape: tuple[int, ...], dtype: DTypeLike) -> None:
         self.shape, self.dtype = shape, np.dtype(dtype)
         self._raw = context.RawArray("b", max(1, math.prod(shape) * self.dtype.itemsize))
 
@@ -82,14 +84,14 @@ class WorkerProcess:
         self,
         context: BaseContext,
         serve: Callable[..., None],
-        makers: Sequence[Callable[[], Any]],
-        shared: Any,
+        makers: Sequence[Callable[[], object]],
+        shared: object,
         first: int,
         number: int,
         name: str,
         spin: float,
         policy: FaultPolicy,
-        *more: Any,
+        *more: object,
     ) -> None:
         self.first = first
         self.number = number
@@ -126,7 +128,7 @@ class WorkerProcess:
                 ) from error
         theirs.close()
 
-    def send(self, command: bytes, *arguments: Any) -> None:
+    def send(self, command: bytes, *arguments: object) -> None:
         """Wake the worker; `wait` finds out if it is gone. ``arguments``: JSON."""
         self._owes |= command != CLOSE
         data = json.dumps(arguments, allow_nan=False).encode() if arguments else b""
@@ -246,7 +248,7 @@ class WorkerProcess:
         self._process.close()
 
 
-def first_look(name: str, make: Callable[[], Any], seconds: float = 1.0) -> None:
+def first_look(name: str, make: Callable[[], gym.Env], seconds: float = 1.0) -> None:
     """Make, reset and step an environment in a forked child, for at most ``seconds``.
 
     EnvironmentFault when it ends the process, which would be this one next. What it raises is left to the
@@ -285,7 +287,7 @@ def first_look(name: str, make: Callable[[], Any], seconds: float = 1.0) -> None
         )
 
 
-def _look(make: Callable[[], Any], write: int) -> NoReturn:
+def _look(make: Callable[[], gym.Env], write: int) -> NoReturn:
     """In the child: a few random steps; an answer through ``write`` when the environment let this process
     live."""
     os.setsid()
@@ -306,7 +308,7 @@ def _look(make: Callable[[], Any], write: int) -> NoReturn:
     os._exit(0)
 
 
-def pack_json(value: Any) -> bytes:
+def pack_json(value: object) -> bytes:
     """A value as JSON text behind its length, as `WorkerProcess` reads it."""
     data = json.dumps(value, allow_nan=False).encode()
     return LENGTH.pack(len(data)) + data

@@ -26,8 +26,10 @@ ARRAY, BYTES, NUMBER = "array", "bytes", "number"
 # the methods by which an environment gives and takes its state
 GET, SET = "get_state", "set_state"
 
+EnvObject = gym.Env | gym.vector.VectorEnv  # one that has been made
 
-def encode(value: Any, place: str = "state") -> Any:
+
+def encode(value: object, place: str = "state") -> Any:
     """``value`` as JSON, without loss. TypeError for what a file could hold only by pickling it."""
     if (
         value is None
@@ -53,7 +55,7 @@ def encode(value: Any, place: str = "state") -> Any:
     )
 
 
-def decode(value: Any) -> Any:
+def decode(value: object) -> Any:
     """The inverse of `encode`; tuples become lists. ValueError for anything else."""
     if isinstance(value, list):
         return [decode(item) for item in value]
@@ -72,7 +74,7 @@ def decode(value: Any) -> Any:
     raise ValueError(f"a saved state holds {str(value)[:80]}, which this version does not read.")
 
 
-def alike(found: Any, like: Any) -> bool:
+def alike(found: object, like: object) -> bool:
     """Whether two arrays, or dicts of them, agree in names, dtypes and shapes; None agrees with None."""
     if isinstance(found, dict) and isinstance(like, dict):
         return found.keys() == like.keys() and all(alike(found[name], like[name]) for name in like)
@@ -97,7 +99,7 @@ def _stateful(env: Any) -> tuple[list[TimeLimit], Any] | None:
     return limits, env
 
 
-def _is_cartpoles(env: Any) -> bool:
+def _is_cartpoles(env: object) -> bool:
     kind = type(getattr(env, "unwrapped", env))
     return (kind.__module__, kind.__name__) == (
         "gymnasium.envs.classic_control.cartpole",
@@ -105,12 +107,12 @@ def _is_cartpoles(env: Any) -> bool:
     )
 
 
-def gives_state(env: Any) -> bool:
+def gives_state(env: EnvObject) -> bool:
     """Whether a single or a vector environment can give its state."""
     return _stateful(env) is not None
 
 
-def saved_state(env: Any) -> Any:
+def saved_state(env: EnvObject) -> Any:
     """A copy of the state of an environment that gives one, for `encode`."""
     layers = _stateful(env)
     assert layers is not None
@@ -173,7 +175,7 @@ MOST_TEXT = 1 << 16  # characters of JSON that an attribute may have
 ABSENT = object()
 
 
-def nested(env: Any) -> Iterator[Any]:
+def nested(env: EnvObject) -> Iterator[Any]:
     """The environment, and those inside it."""
     while True:
         yield env
@@ -182,7 +184,7 @@ def nested(env: Any) -> Iterator[Any]:
         env = env.env
 
 
-def clean(env: Any, names: Sequence[str], seed: int) -> Any:
+def clean(env: EnvObject, names: Sequence[str], seed: int) -> Any:
     """What an environment carries before its first episode. One that gives its state is reset for it, because
     some make their attributes in reset.
     """
@@ -191,7 +193,7 @@ def clean(env: Any, names: Sequence[str], seed: int) -> Any:
     return take(env, names)
 
 
-def take(env: Any, names: Sequence[str]) -> Any:
+def take(env: EnvObject, names: Sequence[str]) -> Any:
     """What an environment carries, as JSON. TypeError for what no file can hold."""
     if not names:
         return encode(saved_state(env))
@@ -199,7 +201,7 @@ def take(env: Any, names: Sequence[str]) -> Any:
     return encode({name: _portable(value) for name, value in found.items() if value is not ABSENT})
 
 
-def give(env: Any, carried: Any, seed: int) -> None:
+def give(env: EnvObject, carried: object, seed: int) -> None:
     """Let an environment carry what `take` found in another copy, or earlier in this one."""
     found = decode(carried)
     if "own" in found:
@@ -215,7 +217,7 @@ def give(env: Any, carried: Any, seed: int) -> None:
         vars(layer)[name.partition(".")[2]] = _built(old, value)
 
 
-def differing(used: Any, fresh: Any) -> list[str]:
+def differing(used: EnvObject, fresh: EnvObject) -> list[str]:
     """Attributes of plain values in which two copies differ."""
     pairs = enumerate(zip(nested(used), nested(fresh), strict=True))
     return [
@@ -227,7 +229,7 @@ def differing(used: Any, fresh: Any) -> list[str]:
     ]
 
 
-def _text(layer: Any, name: str) -> str:
+def _text(layer: object, name: str) -> str:
     """An attribute as text to compare; empty when it holds no plain values, or too many."""
     try:
         text = str(encode(_portable(vars(layer)[name])))
@@ -236,15 +238,15 @@ def _text(layer: Any, name: str) -> str:
     return text if len(text) <= MOST_TEXT else ""
 
 
-def _layer(env: Any, name: str) -> Any:
+def _layer(env: EnvObject, name: str) -> Any:
     return list(nested(env))[int(name.partition(".")[0])]
 
 
-def _attribute(env: Any, name: str) -> Any:
+def _attribute(env: EnvObject, name: str) -> Any:
     return vars(_layer(env, name)).get(name.partition(".")[2], ABSENT)
 
 
-def _portable(value: Any) -> Any:
+def _portable(value: object) -> Any:
     """A value in terms of `encode`. TypeError for an opaque object."""
     if isinstance(value, np.random.Generator):
         return value.bit_generator.state
@@ -263,7 +265,7 @@ def _portable(value: Any) -> Any:
     return value
 
 
-def _built(old: Any, value: Any) -> Any:
+def _built(old: object, value: Any) -> Any:
     """A value of `_portable` in the kind of the one that it replaces; generators stay the same objects."""
     if isinstance(old, np.random.Generator):
         old.bit_generator.state = value

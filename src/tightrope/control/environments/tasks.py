@@ -9,8 +9,8 @@ import importlib
 import importlib.util
 import inspect
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
@@ -32,6 +32,11 @@ NOISE = (
     r"builtin type [Ss]wig\w* has no __module__ attribute",
 )
 
+# What a user may give as environment: a Gymnasium id, an environment, a class or a factory, or a vector
+# environment.
+EnvSource = str | gym.Env | Callable[..., gym.Env] | gym.vector.VectorEnv
+_T = TypeVar("_T")
+
 
 def find_spec(env_id: str) -> EnvSpec | None:
     """The registered spec of an id, Atari included; None without one (yet: "module:Id" imports first)."""
@@ -39,7 +44,7 @@ def find_spec(env_id: str) -> EnvSpec | None:
     return gym.registry.get(env_id.rpartition(":")[2])
 
 
-def name_of(env: Any) -> str:
+def name_of(env: EnvSource) -> str:
     """An id; the id of an environment object, else the name of its class or of the factory."""
     if isinstance(env, str):
         return env
@@ -47,7 +52,7 @@ def name_of(env: Any) -> str:
     return str(known or type(getattr(env, "unwrapped", env)).__name__)
 
 
-def time_limit(env: Any, keywords: Mapping[str, Any] | None = None) -> int | None:
+def time_limit(env: EnvSource, keywords: Mapping[str, Any] | None = None) -> int | None:
     """The steps after which an id or an environment object truncates an episode; None: none, or unknown.
 
     ``keywords``: for gym.make, which takes another limit.
@@ -153,7 +158,7 @@ def make_vector_by_id(env_id: str, num_envs: int, keywords: Mapping[str, Any] | 
     return _explained(env_id, make)
 
 
-def resets_rows_with_seeds(vector: Any) -> bool:
+def resets_rows_with_seeds(vector: gym.vector.VectorEnv) -> bool:
     """Whether single rows of a vector environment can be reset with seeds, and repeat their episodes: Atari's
     do, from ale-py 0.12 on; earlier ones raise or hang.
     """
@@ -167,11 +172,11 @@ def resets_rows_with_seeds(vector: Any) -> bool:
 class _AnyAction(gym.spaces.MultiDiscrete):
     """The same space without its membership test: an action layout gives valid actions by construction."""
 
-    def contains(self, x: Any) -> bool:
+    def contains(self, x: object) -> bool:
         return True
 
 
-def _trusting(env: Any) -> Any:
+def _trusting(env: gym.vector.VectorEnv) -> Any:
     """Skip the check of every action in a vector version that we made: a fifth of a CartPole step."""
     space = env.action_space
     if type(space) is gym.spaces.MultiDiscrete:
@@ -179,7 +184,7 @@ def _trusting(env: Any) -> Any:
     return env
 
 
-def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int, **keywords: Any) -> Any:
+def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int, **keywords: object) -> Any:
     """EnvPool's version of a task; ValueError when EnvPool is missing or does not know the id."""
     try:
         import envpool
@@ -199,14 +204,15 @@ def make_envpool(env_id: str, num_envs: int, seed: int, num_threads: int, **keyw
         return envpool.make(name, env_type="gymnasium", seed=seed, **sizes, **keywords)
 
 
-def require_keywords(env: Any, keywords: Mapping[str, Any], *, vector: bool = False) -> None:
+def require_keywords(env: EnvSource, keywords: Mapping[str, object], *, vector: bool = False) -> None:
     """ValueError for a keyword that the constructor of an id, a class or a factory does not take; it lists
     those that it takes. ``vector``: of the id's vector version. Without effect where the signature cannot be
     known.
     """
     if not keywords:
         return
-    spec, maker, extra = None, env, {}
+    spec, extra = None, {}
+    maker: Any = env
     if isinstance(env, str):
         spec = _explained(env, lambda: gym.spec(env))
         point = spec.vector_entry_point if vector else spec.entry_point
@@ -252,7 +258,7 @@ def _taken(maker: Any) -> dict[str, Any] | None:
     return None if functions else {}
 
 
-def _explained(env_id: str, make: Callable[[], Any]) -> Any:
+def _explained(env_id: str, make: Callable[[], _T]) -> _T:
     """What ``make`` returns; errors about the id or a missing package become a ValueError with advice."""
     spec = find_spec(env_id)
     try:
@@ -291,7 +297,7 @@ def _missing(env_id: str, spec: EnvSpec | None, error: Exception) -> ValueError:
     return ValueError(f"{env_id} cannot be made, something it needs is missing: {error}")
 
 
-def _did_you_mean(name: str, known: Any) -> str:
+def _did_you_mean(name: str, known: Iterable[object]) -> str:
     """`` Did you mean ...?`` over all known ids, whatever their case and version."""
     lowered = {str(key).lower(): str(key) for key in known}
     close = difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.6)
@@ -333,7 +339,9 @@ def make_all(
         made()
 
 
-def close_environment(env: Any, index: int, limit: Limit = contextlib.nullcontext) -> None:
+def close_environment(
+    env: gym.Env | gym.vector.VectorEnv, index: int, limit: Limit = contextlib.nullcontext
+) -> None:
     """Close an environment; EnvironmentFault when its own code raises or hangs. ``limit``: as in
     `make_all`."""
     try:

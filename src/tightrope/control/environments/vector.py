@@ -13,8 +13,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import warnings
-from collections.abc import Callable, Sequence
-from typing import Any, final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeGuard, final
 
 import gymnasium as gym
 import numpy as np
@@ -53,7 +53,7 @@ from tightrope.control.spaces.structure import MASK_KEY, Inputs, Reading
 MODE_KEYS = ("autoreset_mode", "autoreseet-mode")
 
 
-def is_vector_env(env: Any) -> bool:
+def is_vector_env(env: object) -> TypeGuard[VectorEnv]:
     """True for Gymnasium's vector environments, and for EnvPool's, which only look like them."""
     if isinstance(env, VectorEnv):
         return True
@@ -61,7 +61,7 @@ def is_vector_env(env: Any) -> bool:
     return looks_like and not isinstance(env, gym.Env | type)
 
 
-def autoreset_mode(env: Any) -> AutoresetMode:
+def autoreset_mode(env: VectorEnv) -> AutoresetMode:
     """The mode that a vector environment declares; NEXT_STEP with a warning when it declares none."""
     tag = next((env.metadata[key] for key in MODE_KEYS if key in env.metadata), None)
     if isinstance(tag, AutoresetMode):
@@ -313,7 +313,7 @@ class VectorEnvironments(Environments):
         truncated &= ~terminated
         return rewards, terminated, truncated
 
-    def _encode(self, observations: Any) -> Inputs:
+    def _encode(self, observations: object) -> Inputs:
         try:
             inputs = self.observation_layout.encode(observations, batched=True)
         except ValueError as error:
@@ -349,7 +349,7 @@ class VectorEnvironments(Environments):
             step.action_mask[ended] = fresh[ended]
         return step._replace(inputs=inputs)
 
-    def _final_inputs(self, infos: dict[str, Any], rows: np.ndarray) -> Inputs:
+    def _final_inputs(self, infos: Mapping[str, object], rows: np.ndarray) -> Inputs:
         """The true last observations of ``rows``: one per row in an object array, or a dense batch."""
         finals = infos.get("final_obs", infos.get("final_observation"))
         present = infos.get("_final_obs", infos.get("_final_observation", np.ones(self.num_envs, bool)))

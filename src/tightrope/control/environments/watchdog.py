@@ -15,7 +15,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
-from typing import Any
+from types import FrameType
 
 from tightrope.control.environments.faults import EnvironmentTimeout
 
@@ -122,6 +122,6 @@ def limited(name: str, timeout: float | None) -> Iterator[None]:
         watchdog.stop()
 
 
-def _interrupt(number: int, frame: Any) -> None:
+def _interrupt(number: int, frame: FrameType | None) -> None:
     for watchdog in tuple(_watching):
         watchdog.interrupt()

@@ -45,6 +45,10 @@ def mlp(
     return nn.Sequential(*layers)
 
 
+# a module of the user, or a function of (observation space, action space) that returns one
+OwnPolicy = nn.Module | Callable[..., nn.Module]
+
+
 def _orthogonal(layer: Any, gain: float | None, generator: torch.Generator) -> Any:
     nn.init.orthogonal_(layer.weight, gain=1.0 if gain is None else gain, generator=generator)
     nn.init.zeros_(layer.bias)
@@ -107,7 +111,7 @@ class Policy(nn.Module):
         observations: ObservationLayout,
         actions: ActionLayout,
         settings: TrainSettings,
-        own: nn.Module | Callable[[Any, Any], nn.Module] | None = None,
+        own: OwnPolicy | None = None,
     ) -> None:
         super().__init__()
         self.observation_layout, self.layout, self.std = observations, actions, settings.std
@@ -283,7 +287,7 @@ class Policy(nn.Module):
 
 
 def _own_module(
-    own: nn.Module | Callable[[Any, Any], nn.Module] | None,
+    own: OwnPolicy | None,
     observations: ObservationLayout,
     actions: ActionLayout,
 ) -> nn.Module | None:

@@ -394,6 +394,6 @@ class Collector:
         return sorted(found, key=lambda ended: ended[0])
 
 
-def _require_alike(name: str, found: Any, like: Any) -> None:
+def _require_alike(name: str, found: object, like: object) -> None:
     if not states.alike(found, like):  # the compiled engine would read beyond it
         raise ValueError(f"{name} of the episodes have another shape than here")

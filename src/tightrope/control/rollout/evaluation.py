@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from tightrope.control.environments.base import Environments
 from tightrope.control.environments.episode import EVALUATION
 from tightrope.control.environments.faults import policy_of
 from tightrope.control.environments.make import make_environments
+from tightrope.control.environments.tasks import EnvSource
 from tightrope.control.environments.vector import is_vector_env
 from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 from tightrope.control.spaces.structure import Reading
@@ -114,7 +116,7 @@ def step_limit(settings: TrainSettings, environments: Environments, longest: flo
     return max(SHORTEST_LIMIT, 2 * longest, environments.max_episode_steps or 0)
 
 
-def cut_text(result: dict[str, Any], limit: float) -> str | None:
+def cut_text(result: Mapping[str, object], limit: float) -> str | None:
     """The line that tells how many episodes of an evaluation were cut; None: none was."""
     if not (cut := result["cut_episodes"]):
         return None
@@ -124,7 +126,7 @@ def cut_text(result: dict[str, Any], limit: float) -> str | None:
     )
 
 
-def evaluation_environments(env: Any, settings: TrainSettings, episodes: int) -> Environments:
+def evaluation_environments(env: EnvSource | None, settings: TrainSettings, episodes: int) -> Environments:
     """Copies for evaluation: at most MAX_COPIES, apart from those that train, and not in this process where
     all of those are in workers.
 

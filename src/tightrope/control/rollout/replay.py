@@ -189,7 +189,7 @@ class Before(NamedTuple):
 
 
 def begin(
-    collector: Any, saved: tuple[Any, Groups], seed: int, steps: int, tell: Callable[[str], None]
+    collector: Any, saved: tuple[object, Groups], seed: int, steps: int, tell: Callable[[str], None]
 ) -> list[str]:
     """Continue saved episodes, or begin new ones at an agent step; what is to be told about it. ``tell``: of
     what takes long.

@@ -141,7 +141,7 @@ class ActionLayout:
             "give the space its real bounds."
         ]
 
-    def flatten_mask(self, mask: Any, num: int) -> np.ndarray | None:
+    def flatten_mask(self, mask: object, num: int) -> np.ndarray | None:
         """What environments give as masks -> bool [num, L], True = allowed. None stays None.
 
         Flat arrays [num, L] (with one row also [L]), one mask per row, or nested like the space (a part that
@@ -168,14 +168,14 @@ class ActionLayout:
             self._write_mask(part_mask, parts, flat[:, start:stop], mask)
         return flat
 
-    def allowed(self, mask: Any, num: int) -> np.ndarray | None:
+    def allowed(self, mask: object, num: int) -> np.ndarray | None:
         """`flatten_mask`; ValueError also for a row that allows no choice."""
         flat = self.flatten_mask(mask, num)
         if flat is not None and len(blocked := self.blocked_rows(flat)):
             raise ValueError(f"action_masks forbid every choice in row {blocked[0]}; allow at least one.")
         return flat
 
-    def _flat_mask(self, mask: Any, num: int) -> np.ndarray | None:
+    def _flat_mask(self, mask: object, num: int) -> np.ndarray | None:
         """The mask when it is flat or one per row, None when it must be nested."""
         try:
             array = np.asarray(mask)
@@ -188,7 +188,7 @@ class ActionLayout:
             return as_allowed(array).reshape(num, self.num_logits)
         return None
 
-    def _write_mask(self, part: Any, components: list[Component], target: np.ndarray, whole: Any) -> None:
+    def _write_mask(self, part: Any, components: list[Component], target: np.ndarray, whole: object) -> None:
         if part is None:
             return
         pieces = list(part) if len(components) > 1 else [part]

@@ -141,7 +141,7 @@ class ObservationLayout:
                 "them."
             ) from error
 
-    def encode(self, observations: Any, batched: bool) -> Inputs:
+    def encode(self, observations: object, batched: bool) -> Inputs:
         """Inputs of one observation (N = 1) or of a batch in the form of Gymnasium's vector environments.
 
         A batch of plain float64 rows is returned as it is, without a copy. ValueError: a shape or category
@@ -164,12 +164,12 @@ class ObservationLayout:
             leaf.write(value, inputs)
         return inputs
 
-    def write(self, observation: Any, inputs: Inputs) -> None:
+    def write(self, observation: object, inputs: Inputs) -> None:
         """Put one unbatched observation into the only row of ``inputs``; ValueError when it does not fit."""
         for leaf in self.leaves:
             leaf.write(self._value(observation, leaf)[None], inputs)
 
-    def _value(self, observations: Any, leaf: Leaf) -> np.ndarray:
+    def _value(self, observations: object, leaf: Leaf) -> np.ndarray:
         try:
             value = np.asarray(follow(observations, leaf.path))
         except (KeyError, IndexError, TypeError) as error:

@@ -127,7 +127,7 @@ def categories(space: Space) -> tuple[np.ndarray, np.ndarray]:
     return space.nvec.ravel().astype(np.int64), np.asarray(start).ravel().astype(np.int64)
 
 
-def nest(space: Space, parts: Iterator[Any], skip_mask: bool = False) -> Any:
+def nest(space: Space, parts: Iterator[object], skip_mask: bool = False) -> Any:
     """The parts of the leaves, in order, in the structure of the space."""
     if isinstance(space, spaces.Dict):
         return {k: nest(s, parts) for k, s in space.spaces.items() if not (skip_mask and k == MASK_KEY)}
