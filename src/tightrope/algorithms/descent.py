@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +22,7 @@ from tightrope.algorithms.settings import UpdateSettings
 from tightrope.errors import TightropeError
 from tightrope.maths import divergence, statistics, surrogate
 
+_T = TypeVar("_T")
 Model = Callable[[Batch], Evaluation]
 ExtraLoss = Callable[[Model, Batch, Evaluation, Tensor], tuple[Tensor, dict[str, Any]]]
 Draw = Callable[[Batch], Batch]
@@ -341,9 +342,7 @@ class MicroBatches:
     size: int | None
     halvings: int = 0
 
-    def compute(
-        self, rows: int, attempt: Callable[[int | None], Any], optimiser: torch.optim.Optimizer
-    ) -> Any:
+    def compute(self, rows: int, attempt: Callable[[int | None], _T], optimiser: torch.optim.Optimizer) -> _T:
         """Return ``attempt(size)``, which computes a gradient over ``rows`` rows, ``size`` at a time.
 
         When memory runs out, the attempt is repeated at half the size with the same random numbers of torch.

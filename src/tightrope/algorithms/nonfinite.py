@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor, nn
 
-from tightrope.algorithms.batch import Batch
+from tightrope.algorithms.batch import Batch, Evaluation
 from tightrope.errors import TightropeError
 
 REFUSED = (
@@ -42,7 +41,7 @@ def require_restorable(name: str, saved: Tensor, like: Tensor, *, at_least: floa
 
 
 def explain(
-    model: Any,
+    model: Callable[[Batch], Evaluation],
     optimiser: torch.optim.Optimizer,
     batch: Batch,
     minibatch: Batch,
@@ -77,16 +76,16 @@ def _sums(sums: Tensor) -> str | None:
     return None if math.isfinite(loss) else f"The loss is {loss}, though data and outputs are finite,"
 
 
-def _weights(model: Any, optimiser: torch.optim.Optimizer) -> str | None:
+def _weights(model: object, optimiser: torch.optim.Optimizer) -> str | None:
     return first_bad((f"The weight {name}", p.detach()) for name, p in _named(model, optimiser))
 
 
-def _gradients(model: Any, optimiser: torch.optim.Optimizer) -> str | None:
+def _gradients(model: object, optimiser: torch.optim.Optimizer) -> str | None:
     named = ((name, p.grad) for name, p in _named(model, optimiser))
     return first_bad((f"Data and outputs are finite, but the gradient of {name}", g) for name, g in named)
 
 
-def _named(model: Any, optimiser: torch.optim.Optimizer) -> list[tuple[str, nn.Parameter]]:
+def _named(model: object, optimiser: torch.optim.Optimizer) -> list[tuple[str, nn.Parameter]]:
     """The parameters that the optimiser holds, by the model's names for them where it has any."""
     named = getattr(model, "named_parameters", None)
     names = {id(p): name for name, p in named()} if named is not None else {}
@@ -102,7 +101,7 @@ def _data(batch: Batch) -> str | None:
     )
 
 
-def _outputs(model: Any, minibatch: Batch) -> str | None:
+def _outputs(model: Callable[[Batch], Evaluation], minibatch: Batch) -> str | None:
     with torch.no_grad():
         now = model(minibatch)
     parts = (("logits or log-probability", now.logp), ("entropy", now.entropy), ("value", now.values))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 from tightrope.settings.fields import SCHEDULES, Schedule, scheduled, setting
 from tightrope.settings.values import Settings
@@ -64,7 +64,7 @@ class UpdateSettings(Settings):
             **{base: scheduled(getattr(self, base), schedule, progress) for base, schedule in bases.items()}
         )
 
-    def unchecked(self, **values: Any) -> Self:
+    def unchecked(self, **values: object) -> Self:
         """A copy with these values, not checked: a schedule may end at a value that no user may give."""
         copied = copy.copy(self)
         vars(copied).update(values)

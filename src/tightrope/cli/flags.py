@@ -229,7 +229,13 @@ def pair(word: str) -> tuple[str, Any]:
 class Pairs(argparse.Action):
     """Collects pairs in a dict; the word none alone: no dict."""
 
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
         if values == [NONE]:
             setattr(namespace, self.dest, None)
             return

@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from tightrope.cli.flags import UsageError, nearest
 from tightrope.cli.options import (
@@ -191,7 +190,7 @@ def _is_ours(error: BaseException) -> bool:
     )
 
 
-def _show_warning(message: Warning | str, *_args: Any, **_kwargs: Any) -> None:
+def _show_warning(message: Warning | str, *_args: object, **_kwargs: object) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
 

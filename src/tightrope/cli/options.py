@@ -94,7 +94,7 @@ DESCRIPTIONS: dict[str, tuple[str, str, str | None]] = {
 _json_stream: TextIO | None = None  # where --json goes while standard output is kept for it
 
 
-def print_json(value: dict[str, Any]) -> None:
+def print_json(value: Mapping[str, object]) -> None:
     """Print a line of JSON to standard output, for --json; numbers that JSON cannot hold become null."""
     from tightrope.runs.records import dumps
 

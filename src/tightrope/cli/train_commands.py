@@ -142,7 +142,7 @@ def require_transformers() -> None:
         )
 
 
-def _watched(command: str, given: Options, which: int, *args: Any, **values: Any) -> int:
+def _watched(command: str, given: Options, which: int, *args: Any, **values: object) -> int:
     """START or RESUME a run with the display, and print its end; returns the exit code."""
     as_json, quiet = bool(given.get("json")), bool(given.get("quiet"))
     stream = sys.stderr if as_json else sys.stdout

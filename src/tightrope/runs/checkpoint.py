@@ -15,9 +15,9 @@ import io
 import json
 import re
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, SupportsInt, TypeVar
 
 from tightrope.errors import TightropeError
 from tightrope.runs import versions
@@ -54,7 +54,7 @@ def step_of(folder: Path) -> int:
 # ---------------------------------------------------------------------------- writing
 
 
-def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, Any]) -> Path:
+def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: Mapping[str, object]) -> Path:
     """Write a checkpoint and return its folder; an existing one there is replaced once the new one is
     complete.
 
@@ -89,7 +89,7 @@ def save(folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, A
     return folder
 
 
-def _manifest_text(manifest: dict[str, Any]) -> bytes:
+def _manifest_text(manifest: Mapping[str, object]) -> bytes:
     """The only valid text of a manifest, which includes the hash of its content."""
     bare = {name: value for name, value in manifest.items() if name != "sha256"}
     return (dumps({**bare, "sha256": json_sha256(bare)}, indent=2) + "\n").encode("utf-8")
@@ -167,7 +167,7 @@ def verify(folder: Path) -> None:
     _steadily(Path(folder), check)
 
 
-def counted(value: Any) -> int:
+def counted(value: SupportsInt) -> int:
     """A count in a saved state. ValueError for what is none, or does not fit 64 bits."""
     number = int(value)
     if not 0 <= number < 2**63:
@@ -247,7 +247,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def _check_names(folder: Path, files: Any) -> None:
+def _check_names(folder: Path, files: object) -> None:
     path = folder / "manifest.json"
     if not isinstance(files, dict) or "state.json" not in files:
         raise CheckpointError(f"{path} does not declare state.json. {_ADVICE}")
@@ -272,7 +272,7 @@ def _regular(path: Path) -> None:
         raise CheckpointError(f"{path} is not a regular file. {_ADVICE}")
 
 
-def _verified(path: Path, entry: Any, *, read: bool = True) -> bytes:
+def _verified(path: Path, entry: object, *, read: bool = True) -> bytes:
     """The bytes of a file whose size and SHA-256 are the declared ones; unless ``read``, none, and no memory
     for them.
     """

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import difflib
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from tightrope.runs.lock import NAME
 
@@ -19,12 +19,12 @@ USES = {
 }
 
 
-def command_of(settings: dict[str, Any]) -> str | None:
+def command_of(settings: Mapping[str, object]) -> str | None:
     """The command whose settings these are; None when no field tells."""
     return next((name for name, field in OWN_FIELDS.items() if field in settings), None)
 
 
-def require_kind(path: Path, settings: dict[str, Any], command: str) -> None:
+def require_kind(path: Path, settings: Mapping[str, object], command: str) -> None:
     """ValueError when these settings are of a run of another command; it names what can read that run."""
     found = command_of(settings) or command
     if found != command:

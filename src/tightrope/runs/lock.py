@@ -15,6 +15,7 @@ import sys
 import time
 import warnings
 import weakref
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,7 @@ def _note(path: Path) -> dict[str, Any]:
     return note if isinstance(note, dict) else {}
 
 
-def _described(note: dict[str, Any], *, ended: bool = False) -> str:
+def _described(note: Mapping[str, object], *, ended: bool = False) -> str:
     if "pid" not in note:
         return ""
     # in containers a process that ended often had the number that this one has

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ SIGNATURE = "sha256"  # in settings.json: of the settings in it, so that a resum
 RECORDS = ("metrics.jsonl", "episodes.jsonl", "samples.jsonl", "changes.jsonl")
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """``value`` in JSON's own types.
 
     Numbers and arrays of numpy and torch become Python's, paths and other objects text, and a float that is
@@ -43,12 +43,12 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def figures(saved: dict[str, Any]) -> dict[str, float]:
+def figures(saved: Mapping[str, float | None]) -> dict[str, float]:
     """Numbers as they were before `plain` wrote them: null is NaN again."""
     return {name: math.nan if x is None else float(x) for name, x in saved.items()}
 
 
-def dumps(value: Any, indent: int | None = None) -> str:
+def dumps(value: object, indent: int | None = None) -> str:
     """One JSON text without NaN literals; on a single line unless ``indent`` is given."""
     try:
         return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=False)
@@ -57,17 +57,17 @@ def dumps(value: Any, indent: int | None = None) -> str:
     return json.dumps(plain(value), allow_nan=False, indent=indent, ensure_ascii=False)
 
 
-def canonical(value: Any) -> bytes:
+def canonical(value: object) -> bytes:
     """The one JSON text of a value, to be hashed: sorted names, no spaces."""
     return json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
-def json_sha256(value: Any) -> str:
+def json_sha256(value: object) -> str:
     """The SHA-256 of the canonical JSON of a value."""
     return hashlib.sha256(canonical(value)).hexdigest()
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """Write one JSON file so that a reader sees the old one or the new one whole, also after a crash. Raises
     CannotWrite.
     """
@@ -91,17 +91,17 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path} is not readable as JSON ({error}).") from error
 
 
-def signed(settings: dict[str, Any]) -> dict[str, Any]:
+def signed(settings: Mapping[str, object]) -> dict[str, Any]:
     """The settings and their hash."""
     return {**settings, SIGNATURE: json_sha256(settings)}
 
 
-def unsigned(found: dict[str, Any]) -> dict[str, Any]:
+def unsigned(found: Mapping[str, object]) -> dict[str, Any]:
     """The settings without their hash."""
     return {name: value for name, value in found.items() if name != SIGNATURE}
 
 
-def require_own(file: Path, found: dict[str, Any]) -> None:
+def require_own(file: Path, found: Mapping[str, object]) -> None:
     """ValueError if the content of ``file`` does not match its hash; a file without a hash is accepted."""
     if SIGNATURE in found and found[SIGNATURE] != json_sha256(unsigned(found)):
         raise ValueError(
@@ -122,7 +122,7 @@ def read_settings(path: Path, *, own: bool) -> dict[str, Any]:
     return unsigned(settings)
 
 
-def each_key_once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+def each_key_once(pairs: Sequence[tuple[str, object]]) -> dict[str, Any]:
     """A dict of its pairs, for the json module. ValueError for a key that occurs twice: some readers take the
     first and some the last, so the value that was checked might not be the one that is used.
     """

@@ -6,7 +6,7 @@ import contextlib
 import errno
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -55,7 +55,7 @@ class Run:
 
     @classmethod
     def create(
-        cls, run_dir: str | Path | None, settings: dict[str, Any], name: str, home: Path | None = None
+        cls, run_dir: str | Path | None, settings: Mapping[str, object], name: str, home: Path | None = None
     ) -> Run:
         """A new run folder with settings.json in it.
 
@@ -155,19 +155,19 @@ class Run:
         self._append("metrics.jsonl", [{"step": step, "seconds": seconds, **values}])
         return values
 
-    def record_episodes(self, rows: Iterable[dict[str, Any]]) -> None:
+    def record_episodes(self, rows: Iterable[Mapping[str, object]]) -> None:
         """Append finished episodes, one object each (step, return, length, ...), in one write."""
         self._append("episodes.jsonl", rows)
 
-    def record_samples(self, rows: Iterable[dict[str, Any]]) -> None:
+    def record_samples(self, rows: Iterable[Mapping[str, object]]) -> None:
         """Append responses of a language model, one object each (step, prompt, response, scores, ...)."""
         self._append("samples.jsonl", rows)
 
-    def record_changes(self, rows: Iterable[dict[str, Any]]) -> None:
+    def record_changes(self, rows: Iterable[Mapping[str, object]]) -> None:
         """Append changes of settings during the run, one object each (step, setting, value)."""
         self._append("changes.jsonl", rows)
 
-    def _append(self, name: str, rows: Iterable[dict[str, Any]]) -> None:
+    def _append(self, name: str, rows: Iterable[Mapping[str, object]]) -> None:
         text = "".join(dumps(row) + "\n" for row in rows)
         if text:
             self._recorder(name).append(text)
@@ -195,7 +195,7 @@ class Run:
         self,
         step: int,
         tensors: dict[str, dict[str, Tensor]],
-        state: dict[str, Any],
+        state: Mapping[str, object],
         *,
         keep: int | None,
         warn: Callable[[str], None],
@@ -217,7 +217,7 @@ class Run:
         self,
         step: int,
         tensors: dict[str, dict[str, Tensor]],
-        state: dict[str, Any],
+        state: Mapping[str, object],
         *,
         keep: int | None,
         warn: Callable[[str], None],
@@ -357,13 +357,13 @@ class Run:
             (self.path / "summary.json").unlink(missing_ok=True)
             sync_folder(self.path)
 
-    def update_settings(self, settings: dict[str, Any]) -> None:
+    def update_settings(self, settings: Mapping[str, object]) -> None:
         """Replace settings.json: a resumed run may have another budget."""
         self.lock()
         self.settings = plain(settings)
         write_json(self.path / "settings.json", signed(self.settings))
 
-    def finish(self, summary: dict[str, Any]) -> None:
+    def finish(self, summary: Mapping[str, object]) -> None:
         """Write summary.json, which marks a complete run, and close the files."""
         self.lock()
         write_json(self.path / "summary.json", summary)

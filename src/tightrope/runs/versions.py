@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import sys
-from typing import Any
 
 VERSIONED = ("torch", "numpy", "numba", "gymnasium", "transformers")
 
@@ -25,7 +24,7 @@ def known() -> dict[str, str]:
     return found | {name: str(sys.modules[name].__version__) for name in VERSIONED if name in sys.modules}
 
 
-def version_changes(saved: Any) -> str:
+def version_changes(saved: object) -> str:
     """What has changed since ``saved``, an earlier result of `known`, as text; empty if nothing has."""
     saved, now = saved if isinstance(saved, dict) else {}, known()
     changed = [name for name in now if name in saved and saved[name] != now[name]]

@@ -19,15 +19,15 @@ LARGEST_FLOAT, SMALLEST_FLOAT = 3.4e38, 1.2e-38  # of float32; a positive number
 
 
 def setting(
-    default: Any,
+    default: object,
     doc: str,
     *,
     at_least: float = -math.inf,
     at_most: float = math.inf,
     above: float = -math.inf,
     choices: tuple[str, ...] = (),
-    needs: Mapping[str, tuple[Any, ...] | EllipsisType] | None = None,
-    before: Any = dataclasses.MISSING,
+    needs: Mapping[str, tuple[object, ...] | EllipsisType] | None = None,
+    before: object = dataclasses.MISSING,
 ) -> Any:
     """A dataclass field with its help text and its range.
 
@@ -43,7 +43,7 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def fixed(value: Any) -> Any:
+def fixed(value: object) -> Any:
     """A field of a base class with a fixed value here: written to settings.json, but not an option."""
     return dataclasses.field(default=value, init=False)
 
@@ -93,14 +93,14 @@ def kinds(settings: type) -> dict[str, Kind]:
     return {field.name: _kind(hints[field.name]) for field in dataclasses.fields(settings)}
 
 
-def _kind(hint: Any) -> Kind:
+def _kind(hint: object) -> Kind:
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     plain = {Literal: str, tuple: tuple, dict: dict}.get(get_origin(options[0]), options[0])
     items = get_args(options[0])[0] if plain is tuple else int
     return Kind(plain, NoneType in options, items)
 
 
-def typed(name: str, value: Any, kind: Kind) -> Any:
+def typed(name: str, value: object, kind: Kind) -> Any:
     """``value`` as its field holds it: a list as a tuple, a whole number as a float if one is expected.
 
     Raises ValueError for a value of another kind. The settings of an update rule are returned as they are.
@@ -123,7 +123,7 @@ def typed(name: str, value: Any, kind: Kind) -> Any:
     raise ValueError(f"{name} is {value!r} ({type(value).__name__}); expected {kind}.")
 
 
-def _plain(value: Any) -> bool:
+def _plain(value: object) -> bool:
     """Whether JSON can hold a value."""
     if isinstance(value, dict):
         return all(type(key) is str and _plain(item) for key, item in value.items())
@@ -142,7 +142,7 @@ def validate(settings: Any) -> None:
         _check_range(field, value)
 
 
-def _check_range(field: dataclasses.Field[Any], value: Any) -> None:
+def _check_range(field: dataclasses.Field[Any], value: object) -> None:
     limits = field.metadata
     if isinstance(value, str) and limits["choices"] and value not in limits["choices"]:
         raise ValueError(f"{field.name} is {value!r}; expected one of: {', '.join(limits['choices'])}.")

@@ -67,13 +67,13 @@ class Settings:
     def to_json(self) -> dict[str, Any]:
         """The settings as settings.json holds them: plain JSON types, the update rule's under ``update``."""
 
-        def plain(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        def plain(pairs: list[tuple[str, object]]) -> dict[str, Any]:
             return {name: list(value) if isinstance(value, tuple) else value for name, value in pairs}
 
         return dataclasses.asdict(self, dict_factory=plain)
 
     @classmethod
-    def from_json(cls, data: Any, source: object = "settings.json") -> Self:
+    def from_json(cls, data: object, source: object = "settings.json") -> Self:
         """The settings that `to_json` wrote, in an older version too: a name that is missing has the value
         that says what runs did before it was a setting, most often its default. Raises ValueError.
         """
@@ -82,7 +82,7 @@ class Settings:
         return cls().with_values(**{**_before(cls), **_before(rule), **values})
 
     @classmethod
-    def values_from_json(cls, data: Any, source: object = "settings.json") -> dict[str, Any]:
+    def values_from_json(cls, data: object, source: object = "settings.json") -> dict[str, Any]:
         """The values in a settings.json, flat, as `with_values` takes them.
 
         Raises ValueError for an unknown name, a value of another type, and a name in both places.
@@ -93,7 +93,7 @@ class Settings:
             raise ValueError(f"{source}: {error}") from None
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     """As a flag takes it."""
     if value is None:
         return "none"
@@ -111,7 +111,7 @@ def _before(kind: type | None) -> dict[str, Any]:
     return {field.name: field.metadata["before"] for field in fields if "before" in field.metadata}
 
 
-def rule_of(kind: type[Settings], algorithm: Any) -> type[Settings] | None:
+def rule_of(kind: type[Settings], algorithm: object) -> type[Settings] | None:
     """The class of ``update`` for an algorithm (None: the default one); None for settings without it.
 
     Raises ValueError for an unknown algorithm.
@@ -127,7 +127,7 @@ def rule_of(kind: type[Settings], algorithm: Any) -> type[Settings] | None:
     return rules[algorithm]
 
 
-def _flat(kind: type[Settings], data: Any) -> dict[str, Any]:
+def _flat(kind: type[Settings], data: object) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ValueError(f"the settings are {type(data).__name__}, expected an object with names and values.")
     outer = {name: value for name, value in data.items() if name != "update" or name not in names(kind)}
@@ -142,7 +142,7 @@ def _flat(kind: type[Settings], data: Any) -> dict[str, Any]:
     return values | _read(rule, inner)
 
 
-def _read(kind: type, values: dict[str, Any]) -> dict[str, Any]:
+def _read(kind: type, values: Mapping[str, object]) -> dict[str, Any]:
     """Values of one class by name, each of the kind of its field; those of fixed fields are left out."""
     given = names(kind)
     _require_known(kind.__name__, values, kinds(kind))

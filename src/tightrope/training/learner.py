@@ -117,7 +117,7 @@ class Learner(Protocol):
         """Write the final files besides checkpoints; returns the summary."""
 
 
-def change(learner: Learner, setting: str, value: Any) -> None:
+def change(learner: Learner, setting: str, value: object) -> None:
     """Use another value of a setting from the next update on. ValueError for what cannot be changed."""
     settings = getattr(learner.settings, "update", learner.settings)  # the update rule's, where there is one
     names = [name for name in CHANGEABLE if hasattr(settings, name)]
