@@ -4,7 +4,13 @@ not; what a task keeps from one episode to the next is carried to the copy that 
 
 from __future__ import annotations
 
+import collections
+import contextlib
+import copy
+import enum
 import json
+import random
+from collections import Counter, defaultdict, deque
 from typing import Any
 
 import gymnasium as gym
@@ -12,11 +18,14 @@ import numpy as np
 import pytest
 import torch
 
+import tightrope
 from tightrope.control import train
 from tightrope.control.agent import Agent
 from tightrope.control.environments import state as states
+from tightrope.control.environments.faults import EnvironmentFault
 from tightrope.control.resolve import resolve
 from tightrope.runs.run import Run
+from tightrope.training.events import Listeners
 
 wrap = gym.wrappers
 
@@ -164,3 +173,120 @@ def test_what_is_carried_goes_into_other_objects_of_the_same_kind():
     own, moments = b.own, b.env.obs_rms
     states.give(b, json.loads(json.dumps(states.take(a, names))), 0)
     assert not states.differing(a, b) and b.own is own and b.env.obs_rms is moments
+
+
+class Kept(gym.Env):
+    """Keeps one attribute from episode to episode, which every reset changes; two steps an episode."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, kept: Any, change: Any) -> None:
+        self.kept, self.change = kept, change
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.t = 0
+        self.change(self)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        return np.zeros(1, np.float32), float(action), self.t == 2, False, {}
+
+
+class Level(enum.IntEnum):
+    LOW = 1
+    HIGH = 2
+
+
+KINDS = {
+    "tuples in a list": [(0, 1), (1, 0)], "lists in tuples": ([1], (2,)), "a deque": deque([1.5, (2,)], 3),
+    "numbers as keys": {1: "a", (2, 3): [None]}, "a dict of tuples": {"x": (1, 2)},
+    "generators in a list": [np.random.default_rng(1), np.random.Generator(np.random.MT19937(2))],
+    "kinds of numbers": [np.float32(1.5), np.int8(3), 2, True, float("nan"), b"\x00", "word"],
+    "arrays": [np.arange(3), np.array(2.5), np.zeros((2, 0), np.float32)], "random's": [random.Random(4)],
+}  # fmt: skip
+
+
+def shown(value: Any) -> Any:
+    """A value with every kind in it, to compare."""
+    if isinstance(value, np.random.Generator):
+        return str(value.bit_generator.state)
+    if isinstance(value, random.Random):
+        return value.getstate()
+    if isinstance(value, np.ndarray):
+        return ("array", value.dtype, value.shape, value.tolist())
+    if isinstance(value, dict):
+        return [(shown(key), shown(item)) for key, item in value.items()]
+    if isinstance(value, list | tuple | deque):
+        return (type(value), getattr(value, "maxlen", None), [shown(item) for item in value])
+    return type(value), repr(value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_carried_keeps_its_kind_at_every_depth(kind):
+    a, b = Kept(copy.deepcopy(KINDS[kind]), None), Kept(None, None)
+    states.give(b, json.loads(json.dumps(states.take(a, ["0.kept"]))), 0)
+    assert shown(b.kept) == shown(a.kept)
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        [Level.LOW], Counter("aab"), defaultdict(int), {1, 2}, [object()], np.ma.array([1.0]),
+        collections.namedtuple("Point", "x")(1), [0.0] * 1000, np.zeros(10_000),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_a_file_cannot_hold_as_it_is_or_is_too_much_is_not_carried(kept):
+    used = Kept(kept, None)
+    assert states.differing(used, Kept(None, None)) == []
+    with pytest.raises(TypeError, match=r"0\.kept holds (a|more)"):
+        states.take(used, ["0.kept"])
+
+
+def test_a_run_that_is_not_resumed_writes_nothing_into_its_task(tmp_path):
+    objects: list[Any] = []
+
+    def make() -> Kept:
+        order = [(0, 1), (1, 0)]
+        objects.append(order)
+        return Kept(order, lambda env: env.kept.reverse())
+
+    settings = resolve(make, "ppo", {**VALUES, "vector_backend": "serial", "total_steps": 800})
+    agent = tightrope.PPO(make, settings=settings)
+    mine = [env.kept for env in agent.environments._group.envs]
+    run = Run.create(tmp_path / "run", agent.settings.to_json(), "run")
+    with contextlib.closing(agent), run:
+        learner = train.AgentLearner(agent, run, Listeners([]))
+        train.loop.train(learner, run, Listeners([]))
+        now = [env.kept for env in agent.environments._group.envs]
+        learner.close()
+    assert all(a is b for a, b in zip(mine, now, strict=True))
+    written = json.loads((tmp_path / "run" / "settings.json").read_text())
+    assert (written["carried"], written["repeats"]) == ("0.kept", "yes")
+
+
+def test_what_outgrows_a_file_is_told_and_no_longer_carried(tmp_path):
+    make = lambda: Kept([], lambda env: env.kept.append(float(len(env.kept))))  # noqa: E731
+    settings = resolve(make, "ppo", {**VALUES, "vector_backend": "serial", "total_steps": 4000})
+    said: list[str] = []
+    train.train(settings, run_dir=tmp_path / "run", env=make, listeners=[lambda e: said.append(str(e))])
+    told = [line for line in said if "do not repeat from seed" in line]
+    assert len(told) == 1 and "0.kept holds more than a task may keep" in told[0]
+    assert json.loads((tmp_path / "run" / "settings.json").read_text())["repeats"] == "no"
+    said.clear()
+    train.resume(tmp_path / "run", env=make, total_steps=4400, listeners=[lambda e: said.append(str(e))])
+
+
+def test_a_carried_name_that_the_layer_does_not_have():
+    make = lambda: Kept(0, lambda env: None)  # noqa: E731
+    agent = tightrope.PPO(
+        make, carried="0.level", num_envs=2, num_steps=16, minibatch_size=16, engine="torch"
+    )
+    with (
+        contextlib.closing(agent),
+        pytest.raises(EnvironmentFault, match="carried names 0.level, and that lay"),
+    ):
+        agent.learn(64)

@@ -29,7 +29,8 @@ TESTED_SHARE = 0.005  # of the steps of a run that may be spent on tests after t
 REMEDY = (
     "An episode must depend on nothing but reset(seed=...) and the actions: draw from self.np_random, never "
     "from np.random, random or the clock (one copy a worker gives each copy generators of its own), set "
-    "every attribute in reset, or give what is kept by get_state and set_state. Training is not affected; "
+    "every attribute in reset, or name what is kept from episode to episode (--carried LAYER.ATTRIBUTE, "
+    "layer 0 is the outermost wrapper), or give it by get_state and set_state. Training is not affected; "
     "but a resumed run begins new episodes where they differ, and ends with other bits."
 )
 
@@ -133,15 +134,20 @@ class Repetition:
             self.listeners.info(f"Whether episodes repeat is not tested: {error}")
             self._next = 0
             return
-        if not difference:
+        if difference:
+            self.give_up(difference)
+        else:
             self._write(repeats="yes")
-            return
+
+    def give_up(self, reason: str = "") -> None:
+        """Write down that episodes do not repeat; told once with the ``reason``."""
+        if reason and self.agent.settings.repeats != "no":
+            self.listeners.warn(
+                f"The episodes of {self.agent.environments.spec_id} do not repeat from seed and actions in a "
+                f"fresh copy: {reason}. {REMEDY}"
+            )
         self._next = 0
         self._write(repeats="no")
-        self.listeners.warn(
-            f"The episodes of {environments.spec_id} do not repeat from seed and actions in a fresh copy: "
-            f"{difference}. {REMEDY}"
-        )
 
     def _write(self, **values: Any) -> None:
         """Into the settings of the run, and settings.json."""

@@ -293,7 +293,11 @@ class AgentLearner:
         """The agent, the best evaluation, and the episodes that are running where they can be continued."""
         self._repetition.before_save()
         tensors, state = self.agent.snapshot()
-        origins = (state["episodes"] or {}).get("origins", ())
+        episodes = state["episodes"] or {}
+        outgrown = [text for text in episodes.get("carried") or () if isinstance(text, str)]
+        if outgrown:
+            self._repetition.give_up(outgrown[0])
+        origins = () if outgrown else episodes.get("origins", ())
         if not self._told_of_long_episodes and any(steps < 0 for _, _, steps in origins):
             self._told_of_long_episodes = True
             self.listeners.info(
@@ -315,6 +319,8 @@ class AgentLearner:
             lines = self.agent.begin_episodes()
         for line in lines:
             self.listeners.warn(line)
+        if lines:
+            self._repetition.give_up()
 
     def roll_back(self, point: Checkpoint) -> None:
         """Put back a checkpoint of this run; the best policy stays."""

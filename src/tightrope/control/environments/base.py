@@ -88,8 +88,8 @@ class Environments(ABC):
         return None
 
     def carried(self) -> list[Any] | None:
-        """What each copy had carried from earlier episodes at its last seeded reset, encoded; None where no
-        copy carries anything.
+        """What each copy had carried from earlier episodes at its last seeded reset, encoded, or a text that
+        says why it cannot be saved. None where no copy carries anything.
         """
         return None
 

@@ -235,8 +235,11 @@ class EnvGroup:
         if self._seeding.reseed_after is not None and (names or states.gives_state(env)):
             if self._clean[row] is None:
                 self._clean[row] = states.clean(env, names, self._seed_of(row))
+            self.carried[row] = None
             states.give(env, start.carried or self._clean[row], self._seed_of(row))
         observation, info = _check_reset(self._seeded_reset(row))
+        if absent := states.missing(env, names):
+            raise ApiBreak(f"carried names {absent[0]}, and that layer has no such attribute")
         self._plain &= isinstance(observation, np.ndarray)
         self.observation_layout.write(observation, self._rows[row])
         if self.policy.restart:
@@ -251,8 +254,11 @@ class EnvGroup:
     def _seeded_reset(self, row: int) -> tuple[Any, dict[str, Any]]:
         """Reset with the seed of the episode; an episode is a function of it and of what is carried."""
         env = self.envs[row]
-        if self._clean[row] is not None:
-            self.carried[row] = states.take(env, self._seeding.carried)
+        if self._clean[row] is not None and not isinstance(self.carried[row], str):
+            try:
+                self.carried[row] = states.take(env, self._seeding.carried)
+            except TypeError as error:  # from here on it cannot be repeated; see `Environments.carried`
+                self.carried[row] = str(error)
         renew_world(env)
         seed = self._seed_of(row)
         if len(self.envs) == 1:  # what it draws from the global generators is then its own

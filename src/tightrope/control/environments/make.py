@@ -128,7 +128,7 @@ def _require_layers(names: list[str], layers: int) -> None:
             here = f"there are {layers} here" if layers else "vector environments have none"
             raise ValueError(
                 f"carried has {name!r}; expected LAYER.ATTRIBUTE, where layer 0 is the outermost wrapper and "
-                f"{here}. A run finds these names by itself: leave the setting out."
+                f"{here}. A run looks for these names by itself where the setting is left out."
             )
 
 

@@ -171,7 +171,15 @@ RESET = (
     "RecordEpisodeStatistics",
 )
 SILENT = ("spec", "metadata", "action_space", "observation_space", "render_mode")
-MOST_TEXT = 1 << 16  # characters of JSON that an attribute may have
+# what an attribute may hold: so many numbers and containers, of which so many bytes of an array count as one
+MOST_ITEMS, ITEM_BYTES = 256, 64
+PLAIN = (type(None), bool, int, float, str, bytes)
+BIT_GENERATORS = {
+    kind.__name__: kind
+    for kind in (
+        np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64,
+    )
+}  # fmt: skip
 ABSENT = object()
 
 
@@ -194,15 +202,17 @@ def clean(env: EnvObject, names: Sequence[str], seed: int) -> Any:
 
 
 def take(env: EnvObject, names: Sequence[str]) -> Any:
-    """What an environment carries, as JSON. TypeError for what no file can hold."""
+    """What an environment carries, as JSON. TypeError for what no file can hold as it is, or is too much."""
     if not names:
         return encode(saved_state(env))
     found = {name: _attribute(env, name) for name in names}
-    return encode({name: _portable(value) for name, value in found.items() if value is not ABSENT})
+    return encode({name: _portable(value, name) for name, value in found.items() if value is not ABSENT})
 
 
 def give(env: EnvObject, carried: object, seed: int) -> None:
-    """Let an environment carry what `take` found in another copy, or earlier in this one."""
+    """Let an environment carry what `take` found in another copy, or earlier in this one. What it carries
+    already is left alone.
+    """
     found = decode(carried)
     if "own" in found:
         if isinstance(env, gym.Env):
@@ -211,10 +221,15 @@ def give(env: EnvObject, carried: object, seed: int) -> None:
         return
     if any(_attribute(env, name) is ABSENT for name in found):
         env.reset(seed=seed)
-    for name, value in found.items():
-        layer = _layer(env, name)
-        old = vars(layer).get(name.partition(".")[2], None)
-        vars(layer)[name.partition(".")[2]] = _built(old, value)
+    for name, form in found.items():
+        old = _attribute(env, name)
+        if old is ABSENT or encode(_portable(old, name)) != encode(form):
+            vars(_layer(env, name))[name.partition(".")[2]] = _built(old, form)
+
+
+def missing(env: EnvObject, names: Sequence[str]) -> list[str]:
+    """Those of ``names`` that an environment, which has been reset, does not have."""
+    return [name for name in names if _attribute(env, name) is ABSENT]
 
 
 def differing(used: EnvObject, fresh: EnvObject) -> list[str]:
@@ -232,10 +247,9 @@ def differing(used: EnvObject, fresh: EnvObject) -> list[str]:
 def _text(layer: object, name: str) -> str:
     """An attribute as text to compare; empty when it holds no plain values, or too many."""
     try:
-        text = str(encode(_portable(vars(layer)[name])))
-    except (TypeError, KeyError, RecursionError):
+        return str(encode(_portable(vars(layer)[name], name)))
+    except (TypeError, RecursionError):
         return ""
-    return text if len(text) <= MOST_TEXT else ""
 
 
 def _layer(env: EnvObject, name: str) -> Any:
@@ -246,37 +260,68 @@ def _attribute(env: EnvObject, name: str) -> Any:
     return vars(_layer(env, name)).get(name.partition(".")[2], ABSENT)
 
 
-def _portable(value: object) -> Any:
-    """A value in terms of `encode`. TypeError for an opaque object."""
-    if isinstance(value, np.random.Generator):
-        return value.bit_generator.state
-    if isinstance(value, np.random.RandomState):
-        return value.get_state(legacy=False)
-    if isinstance(value, random.Random):
+def _portable(value: Any, place: str, left: list[int] | None = None) -> Any:
+    """A value in terms of `encode`, every container and generator with its kind, so that `_built` gives the
+    same value. TypeError for an object of another kind, subclasses included, and for too much.
+    """
+    left = [MOST_ITEMS] if left is None else left
+    left[0] -= 1 + getattr(value, "nbytes", 0) // ITEM_BYTES
+    if left[0] < 0:
+        raise TypeError(f"{place} holds more than a task may keep from one episode to the next")
+    kind = type(value)
+    if kind in PLAIN or (isinstance(value, np.generic) and value.dtype.kind in ARRAY_KINDS):
+        return value
+    if kind is np.ndarray and value.dtype.kind in ARRAY_KINDS:
+        return value if value.ndim else ["scalar array", value.reshape(1)]
+    if kind in (list, tuple, deque):
+        items = [_portable(item, place, left) for item in value]
+        return [kind.__name__, items, value.maxlen] if kind is deque else [kind.__name__, items]
+    if kind is dict:
+        return ["dict", [[_portable(part, place, left) for part in pair] for pair in value.items()]]
+    if kind is np.random.Generator and type(value.bit_generator).__name__ in BIT_GENERATORS:
+        return ["Generator", value.bit_generator.state]
+    if kind is np.random.RandomState:
+        return ["RandomState", value.get_state(legacy=False)]
+    if kind is random.Random:
         version, numbers, gauss = value.getstate()
-        return [version, list(numbers), gauss]
-    if type(value).__name__ == "RunningMeanStd":  # Gymnasium's, and copies of it
-        return {name: _portable(item) for name, item in vars(value).items()}
-    if isinstance(value, list | tuple | deque):
-        return [_portable(item) for item in value]
-    if isinstance(value, dict):
-        return {name: _portable(item) for name, item in value.items()}
-    encode(value)
-    return value
+        return ["Random", [version, np.array(numbers, np.int64), gauss]]
+    if kind.__name__ == "RunningMeanStd":  # Gymnasium's, and copies of it
+        return ["RunningMeanStd", {name: _portable(item, place, left) for name, item in vars(value).items()}]
+    raise TypeError(f"{place} holds a {kind.__name__}, which no file can hold without pickling it")
 
 
-def _built(old: object, value: Any) -> Any:
-    """A value of `_portable` in the kind of the one that it replaces; generators stay the same objects."""
-    if isinstance(old, np.random.Generator):
-        old.bit_generator.state = value
-    elif isinstance(old, np.random.RandomState):
-        old.set_state(value)
-    elif isinstance(old, random.Random):
-        old.setstate((value[0], tuple(value[1]), value[2]))
-    elif type(old).__name__ == "RunningMeanStd":
-        vars(old).update({name: _built(vars(old).get(name), item) for name, item in value.items()})
-    elif isinstance(old, deque):
-        return deque(value, old.maxlen)
-    else:
-        return tuple(value) if isinstance(old, tuple) else value
-    return old
+def _built(old: Any, form: Any) -> Any:
+    """The value of a `_portable` form. A generator or RunningMeanStd takes it and stays the same object where
+    ``old`` is one of its kind.
+    """
+    if not isinstance(form, list):
+        return form
+    match form:
+        case ["scalar array", value]:
+            return value.reshape(())
+        case ["list", items]:
+            return [_built(None, item) for item in items]
+        case ["tuple", items]:
+            return tuple(_built(None, item) for item in items)
+        case ["deque", items, maxlen]:
+            return deque((_built(None, item) for item in items), maxlen)
+        case ["dict", pairs]:
+            return {_built(None, key): _built(None, item) for key, item in pairs}
+        case ["Generator", state]:
+            bits = BIT_GENERATORS[state["bit_generator"]]
+            if type(old) is not np.random.Generator or type(old.bit_generator) is not bits:
+                old = np.random.Generator(bits())
+            old.bit_generator.state = state
+            return old
+        case ["RandomState", state]:
+            old = old if type(old) is np.random.RandomState else np.random.RandomState()
+            old.set_state(state)
+            return old
+        case ["Random", [version, numbers, gauss]]:
+            old = old if type(old) is random.Random else random.Random()
+            old.setstate((version, tuple(numbers.tolist()), gauss))
+            return old
+        case ["RunningMeanStd", items] if type(old).__name__ == "RunningMeanStd":
+            vars(old).update({name: _built(vars(old).get(name), item) for name, item in items.items()})
+            return old
+    raise ValueError(f"a saved attribute is {str(form)[:80]}, which cannot be put back here.")

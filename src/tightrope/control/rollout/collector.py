@@ -254,7 +254,8 @@ class Collector:
         parts: list[list[Array] | None] = []
         for row, length in enumerate(origins[:, 2].tolist()):
             earlier = [] if length < num_steps else running.parts[row]
-            if earlier is None or length > self.replay_limit:
+            outgrown = carried is not None and isinstance(carried[row], str)
+            if earlier is None or length > self.replay_limit or outgrown:
                 parts.append(None)
             else:
                 parts.append([*earlier, rows[row, -length:]] if length else [])

@@ -249,7 +249,8 @@ def replay(
             raise ValueError(f"the log of copy {row} does not fit its episode")
         script[row, longest - length :] = log
     episodes = np.where(lost, origins[:, 0] + origins[:, 1] + 1, origins[:, 0]).tolist()
-    carried = [None] * copies if saved.carried is None else saved.carried
+    given = [None] * copies if saved.carried is None else saved.carried
+    carried = [None if isinstance(x, str) else x for x in given]  # a text: it could not be saved
     waits = longest - lengths
     starts = list(map(Start, episodes, waits.tolist(), carried))
     inputs, mask = environments.reset(seed, TRAINING, starts)
