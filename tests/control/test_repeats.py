@@ -237,7 +237,7 @@ def test_what_is_carried_keeps_its_kind_at_every_depth(kind):
         [Level.LOW], Counter("aab"), defaultdict(int), {1, 2}, [object()], np.ma.array([1.0]),
         collections.namedtuple("Point", "x")(1), [0.0] * 1000, np.zeros(10_000),
     ],
-    ids=str,
+    ids=["enum", "Counter", "defaultdict", "set", "object", "masked", "namedtuple", "long", "large"],
 )  # fmt: skip
 def test_what_a_file_cannot_hold_as_it_is_or_is_too_much_is_not_carried(kept):
     used = Kept(kept, None)

@@ -78,7 +78,6 @@ A2C_PRESETS: dict[str, dict[str, Any]] = {
         "num_envs": 8,
         "num_steps": 16,
         "learning_rate": 1e-3,
-        "normalise_rewards": True,
         "total_steps": 300_000,
     },
 }
