@@ -544,19 +544,18 @@ def test_a_fault_leaves_the_episode_that_failed_and_three_lines_repeat_it(
             fault = json.loads(file.read_text())
             env = gym.make(fault["id"], **fault["kwargs"])
             env.reset(seed=fault["seed"])
-            for action in fault["actions"][:-1]:
-                observation, _, terminated, truncated, _ = env.step(
-                    np.asarray(action, env.action_space.dtype)
-                )
+            *before, last = env.action_space.from_jsonable(fault["actions"])
+            for action in before:
+                observation, _, terminated, truncated, _ = env.step(action)
                 if terminated or truncated:
                     assert fault["after"]
                     env.reset()
             assert fault["kwargs"] == {"length": 3} and np.isfinite(observation).all()
             if how == "nan":
-                assert np.isnan(env.step(fault["actions"][-1])[0]).all()
+                assert np.isnan(env.step(last)[0]).all()
                 continue
             with pytest.raises(RuntimeError, match="the pole is loose"):
-                env.step(fault["actions"][-1])
+                env.step(last)
     finally:
         del gym.registry["tightrope_tests/Loose-v0"]
 

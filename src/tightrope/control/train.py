@@ -230,12 +230,17 @@ class AgentLearner:
 
     def _kept(self, episode: FailedEpisode) -> str:
         """Write an episode that failed into the run folder; a sentence that says where."""
+        if episode.actions is None:
+            limit = f"replay_limit {self.settings.replay_limit:,}"
+            return f"Its episode was longer than {limit}: no file holds its actions."
         environments, number = self.agent.environments, len(list(self.run.path.glob("fault-*.json"))) + 1
         path = self.run.path / f"fault-{number:04d}.json"
         task = {"id": environments.spec_id, "kwargs": environments.keywords}
         write_json(path, {**task, **episode._asdict()})
+        lost = " But what the task kept from earlier episodes is not known." if episode.carried_lost else ""
         return (
-            f"{path} holds the seed and the actions of the episode; docs/faults.md repeats it in three lines."
+            f"{path} holds the seed and the actions of the episode; docs/faults.md repeats it in three "
+            f"lines.{lost}"
         )
 
     def evaluate(self, update: Update | None) -> dict[str, float]:

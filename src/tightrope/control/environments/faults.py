@@ -57,14 +57,18 @@ class EnvironmentFault(TightropeError, RuntimeError):
 
 class FailedEpisode(NamedTuple):
     """The episode of a copy that failed: the seed of its last seeded reset, how many episodes began since,
-    what the copy carried, and its actions since, as the environment got them, the failing one last.
+    what the copy carried there (and whether that is no longer known), and its actions since, as the
+    environment got them, the failing one last: how many, and in terms of its action space's ``to_jsonable``;
+    None where they are more than ``replay_limit``.
     """
 
     copy: int
     seed: int
     after: int
     carried: Any
-    actions: list[Any]
+    carried_lost: bool
+    steps: int
+    actions: Any
 
 
 class ApiBreak(TightropeError):

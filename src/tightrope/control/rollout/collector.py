@@ -54,6 +54,7 @@ class Collector:
         self._uniform = ~environments.action_layout.gaussian  # bool [A]: columns of uniform noise
         self._step_count = 0
         self._column = 0  # the step of the rollout that is under way
+        self._broken = False  # a rollout ended with an error: only `close` is left
         self._restarts = 0  # those that earlier rollouts reported
         self.failed: FailedEpisode | None = None  # the episode in which an environment ended the rollout
         self.replay_limit = replay_limit
@@ -165,6 +166,7 @@ class Collector:
         try:
             inputs = self._fill(rollout, engine)
         except Exception as error:
+            self._broken = True
             # a NaN observation or a NaN weight is the likelier cause of what failed after it
             self._check(rollout, engine, self._column + 1, self._inputs)
             if isinstance(error, EnvironmentFault) and error.index >= 0:
@@ -187,31 +189,42 @@ class Collector:
         self._step_count += num_steps
         return rollout
 
-    def _failed(self, rollout: Rollout, row: int, column: int, *, now: bool = False) -> FailedEpisode | None:
-        """The episode that ran in a row at a column; ``now``: where the rollout goes no further."""
-        if self._running is None:
+    def _failed(
+        self, rollout: Rollout, row: int, column: int, *, now: bool = False, seen: bool = False
+    ) -> FailedEpisode | None:
+        """The episode that ran in a row at a column; None for environments that do not replay.
+
+        ``now``: the rollout goes no further.  ``seen``: what failed is the observation behind the step, which
+        belongs to the next episode where the step ended one.
+        """
+        running, environments = self._running, self.environments
+        if running is None:
             return None
-        origin, earlier, begin = self._running.origins[row], self._running.parts[row], 0
-        present = self.environments.origins() if now else None
-        found = [(t, x) for t, x in rollout.origins if t < column]
-        for t, origins in [*found, *([] if present is None else [(column, present)])]:
+        origin, earlier, begin = running.origins[row], running.parts[row], 0
+        present = environments.origins()
+        assert present is not None
+        found = [(t, x) for t, x in rollout.origins if t < column + seen]
+        for t, origins in [*found, *([(column, present)] if now else [])]:
             if origins[row, 0] != origin[0]:
                 earlier, begin = [], t + 1
             origin = origins[row]
-        if earlier is None:
-            return None
+        layout, carried, lost = environments.action_layout, running.carried, False
+        if (
+            carried is not None and begin
+        ):  # known of the present episodes; workers do not answer after a fault
+            lost = present[row, 0] != origin[0] or (self._broken and environments.backend != "serial")
+            carried = None if lost else environments.carried()
         width = rollout.actions.shape[2]
-        parts = [part[:, :width].view(np.float32) for part in earlier]
+        parts = [part[:, :width].view(np.float32) for part in earlier or ()]
         actions = np.concatenate([*parts, rollout.actions[row, begin : column + 1]])
-        layout, carried = self.environments.action_layout, self._running.carried
-        seed = self.environments.seeding.seed(row, int(origin[0]))
-        kept = None if carried is None or begin else carried[row]
         return FailedEpisode(
             row,
-            seed,
+            environments.seeding.seed(row, int(origin[0])),
             int(origin[1]),
-            kept,
-            [plain(layout.to_env_single(action)) for action in actions],
+            None if carried is None else carried[row],
+            bool(lost),
+            len(actions),
+            None if earlier is None else plain(layout.space.to_jsonable(list(layout.rows(actions)))),
         )
 
     def record(self, rollout: Rollout) -> None:
@@ -336,14 +349,16 @@ class Collector:
             place, t, index = found
             row = int(which[place])
             where = f"step {first + t}" + ("" if what == "reward" else f", index {index}")
+            self.failed = failed = self._failed(rollout, row, column + t, seen=what == "observation")
+            # by now the copy may be in another episode
+            seed = environments.seed_of(row) if failed is None else failed.seed
             action = None
-            if column + t >= 0:
+            if column + t >= 0 and (failed is None or failed.steps):
                 chosen = rollout.actions[row, column + t]
                 action = action_text(environments.action_layout.to_env_single(chosen))
-            self.failed = self._failed(rollout, row, max(0, column + t))
             raise BadNumbers(
                 f"Environment {row} of {environments.spec_id} returned {what} = {numbers[place, t, index]} "
-                f"at {where}{circumstances(environments.worker_of(row), environments.seed_of(row), action)}; "
+                f"at {where}{circumstances(environments.worker_of(row), seed, action)}; "
                 f"expected finite numbers of at most {FLOAT32_MAX:.2g}. The policy was not updated with it. "
                 "Fix the environment, or clip and check its state there; --on-env-fault restart restarts it "
                 "and continues."
