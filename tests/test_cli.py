@@ -194,7 +194,7 @@ def test_help_says_where_a_preset_decides() -> None:
     for name, default in (
         ("normalise_observations", "preset"), ("entropy_weight", "preset"), ("gamma", "0.99, or preset"),
         ("learning_rate", "0.0003, or preset"), ("total_steps", "100000, or preset"),
-        ("clip_schedule", "constant"), ("evaluate_every", "0.05"),
+        ("clip_schedule", "constant"), ("evaluate_every", "0.05"), ("reseed_after", "0, or preset"),
     ):  # fmt: skip
         assert shown[name].endswith(f"default {default})"), shown[name]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 
 import tightrope
@@ -79,6 +81,7 @@ def test_settings_beyond_what_can_be_are_named(values: dict[str, Any], words: st
         ({"kl_adapt": 0.01}, "kl_adapt 0.01 has no effect: kl_beta is none, and it needs a value"),
         ({"action_bounds": "squash"}, "action_bounds has no effect: the task has no Box action"),
         ({"std": "gsde"}, "std has no effect: the task has no Box action"),
+        ({"log_std_init": -1.0}, "log_std_init has no effect: the task has no Box action"),
         ({"gsde_steps": 4}, "gsde_steps 4 has no effect: std is independent, and it needs gsde"),
         (
             {"num_workers": 2, "vector_backend": "serial"},
@@ -112,6 +115,53 @@ def test_settings_with_an_effect_are_not_told() -> None:
         "kl_horizon 5.0 has no effect: kl_goal is none, and it needs a value."
     ]
     assert SFTSettings(tune="full", lora_rank=4).without_effect()
+
+
+def test_settings_of_a_critic_that_is_not_there_are_told() -> None:
+    values = {
+        "critic_lambda": 0.9,
+        "value_weight": 1.0,
+        "critic_learning_rate": 1e-3,
+        "normalise_values": False,
+    }
+    small = {"num_steps": 64, "engine": "torch"}
+    for baseline, expected in ((False, list(values)), (True, [])):
+        said: list[str] = []
+        more = {**small, "baseline": baseline}
+        tightrope.Reinforce("CartPole-v1", **more, **values, notify=said.append).close()
+        told = [text for text in said if "has no effect: baseline is off, and it needs on." in text]
+        assert sorted(text.split()[0] for text in told) == sorted(expected)
+        said.clear()
+        tightrope.Reinforce("CartPole-v1", **more, notify=said.append).close()
+        assert not [text for text in said if "no effect" in text]
+
+
+def test_settings_of_the_built_in_networks_beside_a_module_of_ones_own_are_told(tmp_path: Path) -> None:
+    def module(observations: Any, actions: Any) -> Any:
+        class Two(torch.nn.Module):
+            def __init__(self) -> None:
+                super().__init__()
+                self.layer = torch.nn.Linear(math.prod(observations.shape), 3)
+
+            def forward(self, seen: Any) -> Any:
+                out = self.layer(seen.flatten(1))
+                return out[:, : 1 if actions.shape else 2], out[:, 2]
+
+        return Two()
+
+    values: dict[str, Any] = {"hidden": (8,), "activation": "relu", "shared": True}
+    said: list[str] = []
+    tightrope.PPO("CartPole-v1", **SMALL, **values, policy=module, notify=said.append).close()
+    expected = [f"{name} has no effect: the policy is a module of your own." for name in values]
+    assert [text for text in said if "no effect" in text] == expected
+    warned: list[Any] = []
+    settings = resolve("CartPole-v1", "ppo", {**SMALL, **values, "total_steps": 64})
+    train(settings, run_dir=tmp_path / "run", policy=module, listeners=[warned.append])
+    assert [e.text for e in warned if "no effect" in getattr(e, "text", "")] == expected
+    said.clear()  # what a preset chose is nobody's mistake
+    tightrope.PPO("Pendulum-v1", **SMALL, policy=module, notify=said.append).close()
+    tightrope.PPO("CartPole-v1", **SMALL, **values, notify=said.append).close()
+    assert not [text for text in said if "no effect" in text]
 
 
 @pytest.mark.parametrize("tiny", [{"value_clip": 1e-8}, {"clip": 1e-9}, {"target_kl": 1e-20}])

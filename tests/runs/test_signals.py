@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from tightrope.cli.main import main
 from tightrope.cli.train_commands import farewell
 from tightrope.runs import signals
 
@@ -102,6 +103,20 @@ def test_before_a_run_and_without_a_checkpoint(tmp_path):
     assert farewell(error, None, 0, "steps", "") == "Stopped by SIGTERM before the run began."
     said = farewell(KeyboardInterrupt(), str(tmp_path), 1200, "responses", "tightrope resume r")
     assert said.startswith("Stopped at response 1,200. There is no checkpoint yet: all 1,200 responses")
+
+
+def test_a_second_signal_in_the_first_evaluation_tells_which_steps_were_done(tmp_path, monkeypatch, capsys):
+    def stopped(*arguments, **keywords):
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("tightrope.control.train.evaluate_agent", stopped)
+    monkeypatch.setattr("tightrope.runs.run.Run.save", stopped)
+    words = ["--num-envs", "2", "--num-steps", "64", "--minibatch-size", "64", "--total-steps", "512"]
+    assert main(["train", "CartPole-v1", *words, "--run-dir", str(tmp_path / "run")]) == 130
+    said = capsys.readouterr().err
+    assert (
+        "Stopped by SIGINT at step 128. There is no checkpoint yet: all 128 steps will be repeated." in said
+    )
 
 
 # ---------------------------------------------------------------------------- real processes

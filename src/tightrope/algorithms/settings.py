@@ -21,7 +21,9 @@ class UpdateSettings(Settings):
     gae_lambda: float = setting(
         0.95, "GAE's lambda: 0 = one-step TD error (bias), 1 = Monte Carlo (variance).", at_least=0, at_most=1
     )
-    value_weight: float = setting(0.5, "Weight of the value loss in the total loss.", at_least=0)
+    value_weight: float = setting(
+        0.5, "Weight of the value loss in the total loss.", at_least=0, needs={"baseline": (True,)}
+    )
     entropy_weight: float = setting(
         0.0, "Weight of the entropy bonus; more keeps the policy exploring for longer.", at_least=0
     )
@@ -32,7 +34,7 @@ class UpdateSettings(Settings):
         3e-4, "Adam's step size (actor, and critic unless it has its own).", above=0
     )
     critic_learning_rate: float | None = setting(
-        None, "Adam's step size for the critic; none: the same.", above=0
+        None, "Adam's step size for the critic; none: the same.", above=0, needs={"baseline": (True,)}
     )
     learning_rate_schedule: Schedule = setting(
         "linear", "How both learning rates fall over the run.", choices=SCHEDULES
@@ -47,6 +49,7 @@ class UpdateSettings(Settings):
     normalise_values: bool = setting(
         True,
         "The critic learns returns at mean 0 and deviation 1; values stay in units of the return.",
+        needs={"baseline": (True,)},
         before=False,
     )
     micro_batch_size: int | None = setting(

@@ -155,8 +155,10 @@ def _watched(command: str, given: Options, which: int, *args: Any, **values: obj
     except KeyboardInterrupt as error:
         run = args[0] if which == RESUME else shown.run
         again = _command("resume", run, given) if run else ""
-        print(farewell(error, run, shown.step, view.counted, again), file=sys.stderr)
-        return error.code if isinstance(error, signals.Stopped) else 130
+        stopped = isinstance(error, signals.Stopped)
+        step = max(shown.step, error.position if stopped else 0)  # what was done, and perhaps not shown yet
+        print(farewell(error, run, step, view.counted, again), file=sys.stderr)
+        return error.code if stopped else 130
     except CannotWrite as error:
         if shown.run and error.command:
             with contextlib.suppress(ValueError, OSError):  # the folder may be gone

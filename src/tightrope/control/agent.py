@@ -111,7 +111,7 @@ class Agent:
         self._update_seconds: float | None = None  # of the newest update
         self.settings = resolved(present, self.environments, self.engine.name, threads)
         if settings is None:
-            for text in without_effect(present, self.environments.action_layout):
+            for text in without_effect(present, layouts[1], own_policy=policy is not None):
                 notify(text)
 
     # ---------------------------------------------------------------------------------------------- learning

@@ -99,7 +99,7 @@ def decided(algorithm: str) -> tuple[set[str], set[str]]:
     """
     kinds = [set(preset("", algorithm, kind)) for kind in KINDS]
     listed = {name for values in BY_TASK[algorithm].values() for name in values}
-    return listed.union(*kinds), set.intersection(*kinds)
+    return listed.union(*kinds, preset("ALE/", algorithm)), set.intersection(*kinds)
 
 
 def preset(
@@ -114,6 +114,8 @@ def preset(
     if listed is not None:
         return dict(listed)
     values: dict[str, Any] = {"entropy_weight": 0.0 if kind == "continuous" else 0.01}
+    if env_id.startswith("ALE/"):  # a seeded reset loads the game again, 80 ms
+        values["reseed_after"] = 8192
     if kind == "images":
         values |= {
             "num_steps": 128,

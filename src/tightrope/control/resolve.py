@@ -8,7 +8,7 @@ import functools
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from tightrope.control.presets import BY_TASK, preset
+from tightrope.control.presets import BY_TASK, KINDS, preset
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
 from tightrope.runs import signals
 
@@ -54,8 +54,6 @@ def resolve_with_preset(
     sizes = (merged["num_envs"], merged["num_steps"])
     if algorithm == "ppo" and "minibatch_size" not in values and all(type(size) is int for size in sizes):
         chosen["minibatch_size"] = max(1, min(chosen.get("minibatch_size", 64), sizes[0] * sizes[1]))
-    if env_id.startswith("ALE/"):  # a seeded reset loads the game again, 80 ms
-        chosen["reseed_after"] = 8192
     settings = TrainSettings(env=env_id).with_values(algorithm=algorithm, **{**chosen, **values})
     return settings, chosen
 
@@ -162,12 +160,18 @@ def resolved(
     )
 
 
-def without_effect(settings: TrainSettings, actions: ActionLayout) -> list[str]:
-    """Which settings were changed and do nothing for these actions."""
-    found, box = settings.without_effect(), bool(actions.gaussian.any())
-    usual = {"std": "independent", "action_bounds": "map"}
-    return found + [
-        f"{name} has no effect: the task has no Box action."
-        for name, value in usual.items()
-        if not box and getattr(settings, name) != value
+def without_effect(settings: TrainSettings, actions: ActionLayout, *, own_policy: bool) -> list[str]:
+    """Which settings were changed, other than by a preset, and do nothing for these actions, or for a policy
+    module of the user's own.
+    """
+    usual = [vars(TrainSettings()), *(preset(settings.env, settings.algorithm, kind) for kind in KINDS)]
+    reasons = {}
+    if not actions.gaussian.any():
+        reasons |= dict.fromkeys(("std", "log_std_init", "action_bounds"), "the task has no Box action")
+    if own_policy:
+        reasons |= dict.fromkeys(("hidden", "activation", "shared"), "the policy is a module of your own")
+    return settings.without_effect() + [
+        f"{name} has no effect: {reason}."
+        for name, reason in reasons.items()
+        if all(getattr(settings, name) != values.get(name, ...) for values in usual)
     ]

@@ -35,7 +35,11 @@ class TrainSettings(Settings):
     num_envs: int = setting(8, "Copies of the task that run side by side.", at_least=1, at_most=1_000_000)
     num_steps: int = setting(256, "Steps of each copy per rollout.", at_least=1)
     critic_lambda: float | None = setting(
-        None, "GAE's lambda of the critic's targets; none: gae_lambda.", at_least=0, at_most=1
+        None,
+        "GAE's lambda of the critic's targets; none: gae_lambda.",
+        at_least=0,
+        at_most=1,
+        needs={"baseline": (True,)},
     )
 
     hidden: tuple[int, ...] = setting(

@@ -57,7 +57,8 @@ def train(
     require_tensorboard(settings.tensorboard)
     source = settings.env if env is None else env
     agent = AGENTS[settings.algorithm](source, policy=policy, settings=settings, notify=report.info)
-    for text in without_effect(settings, agent.environments.action_layout):
+    own = agent.policy.own is not None
+    for text in without_effect(settings, agent.environments.action_layout, own_policy=own):
         report.warn(text)
     settings = agent.settings
     name = f"{settings.env}-{settings.algorithm}-{settings.seed}"
@@ -65,7 +66,7 @@ def train(
         agent.require_enough(settings.total_steps)  # before there is a folder of a run that cannot begin
         with Run.create(run_dir, settings.to_json(), name, home) as run:
             learner = AgentLearner(agent, run, report)
-            if agent.policy.own is not None or not isinstance(source, str):
+            if own or not isinstance(source, str):
                 # settings.json is not enough to make these first weights again
                 tensors, state = learner.snapshot()
                 run.save(0, tensors, state, keep=settings.keep_checkpoints, warn=report.warn)

@@ -22,7 +22,11 @@ PATIENCE = 10.0  # seconds: work that takes longer is left, where it can be undo
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked the run to stop. ``code`` is the exit code of the command: 130 or 143."""
+    """A signal asked the run to stop. ``code`` is the exit code of the command: 130 or 143. ``position``: what
+    the run had done by then, of steps or responses.
+    """
+
+    position = 0
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)

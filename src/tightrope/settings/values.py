@@ -54,7 +54,9 @@ class Settings:
             if not field.init or value == field.default:
                 continue
             for other, useful in field.metadata.get("needs", {}).items():
-                present = flat.get(other)
+                if other not in flat:  # of another update rule
+                    continue
+                present = flat[other]
                 if bool(present) if useful is ... else present in useful:
                     continue
                 wanted = "a value" if useful is ... else " or ".join(map(_shown, useful))

@@ -54,8 +54,13 @@ class _Loop:
             try:
                 summary = self._train()
             except KeyboardInterrupt as stop:
-                self._save_and_leave(stop)
-                raise
+                try:
+                    self._save_and_leave(stop)
+                except signals.Stopped as second:
+                    stop = second
+                if isinstance(stop, signals.Stopped):
+                    stop.position = self.learner.position
+                raise stop
         self.listeners(Finished(summary))
         return summary
 
