@@ -517,8 +517,19 @@ def test_environments_that_cannot_be_continued_are_told_once(tmp_path):
     listen = [lambda event: said.append(str(event))]
     train.train(settings, run_dir=tmp_path / "run", env=vector, listeners=listen)
     assert len([line for line in said if "they begin new episodes" in line]) == 1
+    assert "neither be repeated" in str(said)
     train.resume(tmp_path / "run", env=vector, total_steps=700)
     vector.close()
+
+
+@pytest.mark.parametrize("backend", ["serial", "workers"])
+def test_without_seeds_the_setting_is_named_and_not_the_environments(tmp_path, backend):
+    said: list[str] = []
+    settings = settings_for("Acrobot-v1", engine="torch", vector_backend=backend, reseed_after=None)
+    train.train(settings, run_dir=tmp_path / "run", listeners=[lambda event: said.append(str(event))])
+    told = [line for line in said if "they begin new episodes" in line]
+    assert len(told) == 1 and "With reseed_after none only first episodes have seeds" in told[0]
+    assert "neither" not in told[0]
 
 
 def test_evaluating_twice_gives_the_same(whole):

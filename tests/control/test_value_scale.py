@@ -86,14 +86,19 @@ def test_values_are_the_returns_of_the_task(how):
     assert agent.value(seen) == pytest.approx(expected, rel=0.02)
 
 
-def test_values_of_long_episodes_are_exact_by_the_defaults():
-    """3,000 steps, paid at the end: a dozen rollouts of 256 steps each must hand the reward on."""
+@pytest.mark.parametrize(
+    ("length", "size", "steps", "off"),
+    [(300, {}, 100_000, 0.004), (3_000, dict(num_envs=1, num_steps=2_048), 150_000, 0.03)],
+)
+def test_values_of_long_episodes_come_near_the_return_at_their_end(length, size, steps, off):
+    """What docs/control.md says. 3,000 steps need one copy and long rollouts: the defaults' rollouts of 256
+    steps hand the reward on a dozen times, and take far more steps.
+    """
     agent = tightrope.PPO(
-        chain(length=3_000), seed=0, gamma=0.999, num_envs=1, num_steps=2_048, evaluate_every=None, **QUIET
-    ).learn(150_000)
-    seen = np.arange(3_000, dtype=np.float32)[:, None] / 3_000
-    expected = 0.999 ** (2_999 - np.arange(3_000))
-    assert np.abs(agent.value(seen) - expected).mean() < 0.02
+        chain(length=length), seed=0, gamma=0.999, evaluate_every=None, **size, **QUIET
+    ).learn(steps)
+    seen = np.arange(length, dtype=np.float32)[:, None] / length
+    assert agent.value(seen) == pytest.approx(0.999 ** (length - 1 - np.arange(length)), rel=off)
 
 
 def test_the_critic_has_a_lambda_of_its_own():

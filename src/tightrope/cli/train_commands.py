@@ -155,10 +155,10 @@ def _watched(command: str, given: Options, which: int, *args: Any, **values: obj
     except KeyboardInterrupt as error:
         run = args[0] if which == RESUME else shown.run
         again = _command("resume", run, given) if run else ""
-        stopped = isinstance(error, signals.Stopped)
-        step = max(shown.step, error.position if stopped else 0)  # what was done, and perhaps not shown yet
-        print(farewell(error, run, step, view.counted, again), file=sys.stderr)
-        return error.code if stopped else 130
+        code, done = (error.code, error.position) if isinstance(error, signals.Stopped) else (130, 0)
+        # what was done is perhaps not shown yet
+        print(farewell(error, run, max(shown.step, done), view.counted, again), file=sys.stderr)
+        return code
     except CannotWrite as error:
         if shown.run and error.command:
             with contextlib.suppress(ValueError, OSError):  # the folder may be gone

@@ -165,7 +165,7 @@ def without_effect(settings: TrainSettings, actions: ActionLayout, *, own_policy
     module of the user's own.
     """
     usual = [vars(TrainSettings()), *(preset(settings.env, settings.algorithm, kind) for kind in KINDS)]
-    reasons = {}
+    reasons: dict[str, str] = {}
     if not actions.gaussian.any():
         reasons |= dict.fromkeys(("std", "log_std_init", "action_bounds"), "the task has no Box action")
     if own_policy:

@@ -106,7 +106,7 @@ class TrainSettings(Settings):
 
     reseed_after: int | None = setting(
         0,
-        "Steps after which a copy's next episode gets a seed of its own; none: only the first one does.",
+        "Steps after which an episode gets a seed of its own; none: only the first does, no exact resume.",
         at_least=0,
         before=None,
     )

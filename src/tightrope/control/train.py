@@ -199,10 +199,14 @@ class AgentLearner:
             self._open_evaluation()
         environments = self.agent.environments
         if not (environments.replays or environments.gives_state):
+            why = "These environments can neither be repeated from seeds and actions nor give their state"
+            if environments.repeatable:
+                why = (
+                    "With reseed_after none only first episodes have seeds, and later ones cannot be repeated"
+                )
             self.listeners.info(
-                "These environments can neither be repeated from seeds and actions nor give their state: "
-                "when the run is resumed they begin new episodes, and its end has other bits than without a "
-                "break."
+                f"{why}: when the run is resumed they begin new episodes, and its end has other bits than "
+                "without a break."
             )
         workers = f" in {environments.num_workers} processes" if environments.num_workers > 1 else ""
         count = f"{environments.num_envs} x {self.settings.env}"

@@ -22,8 +22,8 @@ PATIENCE = 10.0  # seconds: work that takes longer is left, where it can be undo
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked the run to stop. ``code`` is the exit code of the command: 130 or 143. ``position``: what
-    the run had done by then, of steps or responses.
+    """A signal asked the run to stop. ``code``: the exit code of the command, 130 or 143. ``position``: the
+    steps or responses that the run had done by then.
     """
 
     position = 0

@@ -34,7 +34,8 @@ def setting(
     ``at_least`` and ``at_most`` are inclusive, ``above`` is exclusive, ``choices`` lists the words allowed.
     A default of None means the setting is optional and ``none`` on the command line switches it off.
     ``needs``: the values that other settings, where there are any of these names, must have for this one to
-    have an effect; ``...``: any that is not none, off or 0. ``before``: what runs did that do not have the setting, where that is not the default.
+    have an effect; ``...``: any that is not none, off or 0. ``before``: what runs did that do not have the
+    setting, where that is not the default.
     """
     metadata = {"doc": doc, "at_least": at_least, "at_most": at_most, "above": above, "choices": choices}
     metadata["needs"] = needs or {}

@@ -36,6 +36,16 @@ def _naming_the_command(run: Run) -> Iterator[None]:
         raise
 
 
+@contextlib.contextmanager
+def _naming_the_position(learner: Learner) -> Iterator[None]:
+    """A signal, also a second one, tells what the run had done by then."""
+    try:
+        yield
+    except signals.Stopped as stop:
+        stop.position = learner.position
+        raise
+
+
 class _Loop:
     """A learner, its run folder and its listeners."""
 
@@ -49,18 +59,13 @@ class _Loop:
     def train(self) -> dict[str, Any]:
         if self.learner.settings.tensorboard:
             self.listeners.add(TensorBoard())
-        with signals.stoppable(), _naming_the_command(self.run):
+        with signals.stoppable(), _naming_the_command(self.run), _naming_the_position(self.learner):
             self._keep_handlers()
             try:
                 summary = self._train()
             except KeyboardInterrupt as stop:
-                try:
-                    self._save_and_leave(stop)
-                except signals.Stopped as second:
-                    stop = second
-                if isinstance(stop, signals.Stopped):
-                    stop.position = self.learner.position
-                raise stop
+                self._save_and_leave(stop)
+                raise
         self.listeners(Finished(summary))
         return summary
 

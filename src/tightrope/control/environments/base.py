@@ -32,7 +32,7 @@ class Environments(ABC):
     layers: int = 0  # of a single environment: its wrappers and itself
     makers: Sequence[Any] = ()  # of single environments: one function a copy
     reading: Reading
-    replays: bool = False  # single environments, whose episodes repeat from seed and actions
+    repeatable: bool = False  # whether seeded episodes, like those of single environments, repeat
     gives_state: bool = False  # a vector environment that can give its state (see state.py)
     num_envs: int
     observation_layout: ObservationLayout
@@ -43,6 +43,11 @@ class Environments(ABC):
         self.policy = policy
         self.seeding = Seeding(0)
         self._restarts = Restarts(policy)
+
+    @property
+    def replays(self) -> bool:
+        """Whether episodes are seeded and repeat from seed and actions."""
+        return self.repeatable and self.reseed_after is not None
 
     @property
     def restarts(self) -> int:

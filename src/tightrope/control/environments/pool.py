@@ -79,6 +79,8 @@ class EnvironmentPool(Environments):
     that process are.
     """
 
+    repeatable = True
+
     def __init__(
         self,
         makers: Sequence[Callable[[], gym.Env]],
@@ -166,11 +168,6 @@ class EnvironmentPool(Environments):
         makers, entropy = self.makers[first:last], (self._entropy, number, self.restarts)
         more = (self.name, spin, self.policy, self.reading, entropy)
         return WorkerProcess(self._context, _serve, makers, self._shared, first, number, *more)
-
-    @property
-    def replays(self) -> bool:  # type: ignore[override]
-        """See Environments."""
-        return self.reseed_after is not None
 
     def _reset(self, starts: Sequence[Start] | None) -> tuple[Inputs, np.ndarray | None]:
         if self._watchdog is not None:

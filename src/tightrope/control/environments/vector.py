@@ -246,9 +246,9 @@ class VectorEnvironments(Environments):
     # ------------------------------------------------------------------------------------------ seeds of rows
 
     @property
-    def replays(self) -> bool:  # type: ignore[override]
+    def repeatable(self) -> bool:  # type: ignore[override]
         """See Environments."""
-        return self._resets_rows and self.reseed_after is not None and self.mode == AutoresetMode.SAME_STEP
+        return self._resets_rows and self.mode == AutoresetMode.SAME_STEP
 
     def origins(self) -> np.ndarray | None:
         """See Environments."""
