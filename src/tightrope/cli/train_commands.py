@@ -155,9 +155,9 @@ def _watched(command: str, given: Options, which: int, *args: Any, **values: obj
     except KeyboardInterrupt as error:
         run = args[0] if which == RESUME else shown.run
         again = _command("resume", run, given) if run else ""
-        code, done = (error.code, error.position) if isinstance(error, signals.Stopped) else (130, 0)
-        # what was done is perhaps not shown yet
-        print(farewell(error, run, max(shown.step, done), view.counted, again), file=sys.stderr)
+        code, reached = (error.code, error.position) if isinstance(error, signals.Stopped) else (130, 0)
+        # the display may be behind
+        print(farewell(error, run, max(shown.step, reached), view.counted, again), file=sys.stderr)
         return code
     except CannotWrite as error:
         if shown.run and error.command:
