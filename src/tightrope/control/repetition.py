@@ -28,10 +28,11 @@ STEPS = 50  # of each short episode that a copy is used for
 TESTED_SHARE = 0.005  # of the steps of a run that may be spent on tests after the first two
 REMEDY = (
     "An episode must depend on nothing but reset(seed=...) and the actions: draw from self.np_random, never "
-    "from np.random, random or the clock (one copy a worker gives each copy generators of its own), set "
-    "every attribute in reset, or name what is kept from episode to episode (--carried LAYER.ATTRIBUTE, "
-    "layer 0 is the outermost wrapper), or give it by get_state and set_state. Training is not affected; "
-    "but a resumed run begins new episodes where they differ, and ends with other bits."
+    "from np.random, random or the clock (--vector-backend workers --num-workers N, one copy a worker, gives "
+    "each copy generators and classes of its own), set every attribute in reset, or name what is kept from "
+    "episode to episode (--carried LAYER.ATTRIBUTE, layer 0 is the outermost wrapper), or give it by "
+    "get_state and set_state. Training is not affected; but a resumed run begins new episodes where they differ, and "
+    "ends with other bits."
 )
 
 

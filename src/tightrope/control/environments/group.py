@@ -238,7 +238,7 @@ class EnvGroup:
             self.carried[row] = None
             states.give(env, start.carried or self._clean[row], self._seed_of(row))
         observation, info = _check_reset(self._seeded_reset(row))
-        if absent := states.missing(env, names):
+        if absent := states.not_there(env, names):
             raise ApiBreak(f"carried names {absent[0]}, and that layer has no such attribute")
         self._plain &= isinstance(observation, np.ndarray)
         self.observation_layout.write(observation, self._rows[row])

@@ -173,7 +173,7 @@ RESET = (
 SILENT = ("spec", "metadata", "action_space", "observation_space", "render_mode")
 # what an attribute may hold: so many numbers and containers, of which so many bytes of an array count as one
 MOST_ITEMS, ITEM_BYTES = 256, 64
-PLAIN = (type(None), bool, int, float, str, bytes)
+KEPT_AS_IS = (type(None), bool, int, float, str, bytes)
 BIT_GENERATORS = {
     kind.__name__: kind
     for kind in (
@@ -227,7 +227,7 @@ def give(env: EnvObject, carried: object, seed: int) -> None:
             vars(_layer(env, name))[name.partition(".")[2]] = _built(old, form)
 
 
-def missing(env: EnvObject, names: Sequence[str]) -> list[str]:
+def not_there(env: EnvObject, names: Sequence[str]) -> list[str]:
     """Those of ``names`` that an environment, which has been reset, does not have."""
     return [name for name in names if _attribute(env, name) is ABSENT]
 
@@ -269,7 +269,7 @@ def _portable(value: Any, place: str, left: list[int] | None = None) -> Any:
     if left[0] < 0:
         raise TypeError(f"{place} holds more than a task may keep from one episode to the next")
     kind = type(value)
-    if kind in PLAIN or (isinstance(value, np.generic) and value.dtype.kind in ARRAY_KINDS):
+    if kind in KEPT_AS_IS or (isinstance(value, np.generic) and value.dtype.kind in ARRAY_KINDS):
         return value
     if kind is np.ndarray and value.dtype.kind in ARRAY_KINDS:
         return value if value.ndim else ["scalar array", value.reshape(1)]
