@@ -31,8 +31,8 @@ REMEDY = (
     "from np.random, random or the clock (--vector-backend workers --num-workers N, one copy a worker, gives "
     "each copy generators and classes of its own), set every attribute in reset, or name what is kept from "
     "episode to episode (--carried LAYER.ATTRIBUTE, layer 0 is the outermost wrapper), or give it by "
-    "get_state and set_state. Training is not affected; but a resumed run begins new episodes where they differ, and "
-    "ends with other bits."
+    "get_state and set_state. Training is not affected; but a resumed run begins new episodes where they "
+    "differ, and ends with other bits."
 )
 
 
