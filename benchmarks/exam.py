@@ -4,6 +4,7 @@
     python benchmarks/exam.py --tasks bounds-512-follow,delay-5 --seeds 1
     python benchmarks/exam.py --fast                            # three tasks, one seed, seconds
     python benchmarks/exam.py --table                           # only prints what is known
+    python benchmarks/exam.py --render                          # the committed table into docs/benchmarks.md
 
 A contender gets the task, a seed and a number of steps: ``tightrope.PPO(env, seed=s).learn(n)`` beside
 stable-baselines3's PPO with its defaults, in an interpreter of its own, which installs with
@@ -42,6 +43,7 @@ from gymnasium import spaces
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "exam.json"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
 EPISODES, LONG_EPISODES, FIRST_SEED, SOLVED = 100, 20, 10_000, 0.95
 MAX_STEPS = 5_000  # an episode of evaluation that has not ended by then counts as it stands
 FAST = {"one-step-bandit": 4_096, "actions-multibinary": 8_192, "discrete": 8_192}  # task: steps
@@ -246,6 +248,13 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def render(page: Path, text: str) -> str:
+    """A page with the table between its markers."""
+    begin, end = "<!-- figures:exam -->", "<!-- figures:end-exam -->"
+    head, rest = page.read_text(encoding="utf-8").split(begin)
+    return f"{head}{begin}\n{text}\n{end}{rest.split(end)[1]}"
+
+
 def main(words: list[str] | None = None) -> int:
     """Run, or with ``sit`` and ``versions`` be the process of one contender."""
     words = sys.argv[1:] if words is None else words
@@ -271,8 +280,13 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=RESULTS, help="results file; rows in it are kept")
     parser.add_argument("--fast", action="store_true", help="three easy tasks, few steps, one seed")
     parser.add_argument("--table", action="store_true", help="only print the table of the results file")
+    parser.add_argument("--render", action="store_true", help="only write the committed table into docs/")
     options = parser.parse_args(words)
     options.words = words
+    if options.render:
+        rows = json.loads(RESULTS.read_text(encoding="utf-8"))["rows"]
+        PAGE.write_text(render(PAGE, table(rows)), encoding="utf-8")
+        return 0
     if options.table:
         results = json.loads(options.out.read_text(encoding="utf-8"))
     else:

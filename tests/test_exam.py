@@ -72,6 +72,11 @@ def test_an_episode_without_an_end_is_cut():
     assert cut == 2 and returns == pytest.approx([-0.5, -0.5])
 
 
+def test_the_page_shows_the_committed_results():
+    rows = json.loads(exam.RESULTS.read_text(encoding="utf-8"))["rows"]
+    assert exam.render(exam.PAGE, exam.table(rows)) == exam.PAGE.read_text(encoding="utf-8")
+
+
 def test_the_fast_part_runs_and_is_not_run_again(tmp_path: Path, capsys: pytest.CaptureFixture):
     words = ["--fast", "--tasks", "one-step-contextual", "--out", str(tmp_path / "exam.json")]
     assert exam.main(words) == 0

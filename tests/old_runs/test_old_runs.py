@@ -122,7 +122,7 @@ def test_control_runs_of_the_first_day_are_refused_with_the_version(stand_in):
         assert {k: v for k, v in left.items() if k.name != "writer.lock"} == {
             k: v for k, v in files.items() if k.name != "writer.lock"
         }
-        assert "(0.1.0)" in recorded(FIRST, f"{name}-resumed")["numbers"]["refused"]
+        assert "tightrope 0.1.0;" in recorded(FIRST, f"{name}-resumed")["numbers"]["refused"]
 
 
 def test_a_resume_has_work_to_do():
