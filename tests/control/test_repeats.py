@@ -246,6 +246,14 @@ def test_what_a_file_cannot_hold_as_it_is_or_is_too_much_is_not_carried(kept):
         states.take(used, ["0.kept"])
 
 
+@pytest.mark.parametrize("grown", [[0.0] * 1000, {1, 2}], ids=["long", "set"])
+def test_what_has_outgrown_a_file_is_put_back_all_the_same(grown):
+    """A rollback begins in used copies."""
+    used = Kept(grown, None)
+    states.give(used, states.take(Kept([(1,)], None), ["0.kept"]), 0)
+    assert used.kept == [(1,)]
+
+
 def test_a_run_that_is_not_resumed_writes_nothing_into_its_task(tmp_path):
     objects: list[Any] = []
 

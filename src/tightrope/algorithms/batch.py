@@ -68,7 +68,7 @@ class Batch:
             outputs = scale.outputs(torch.stack([self.old_values, self.returns]))
             numbers |= dict(zip(names, outputs, strict=False))
             if advantages:
-                numbers["advantages"] = self.advantages / (scale.deviation or 1.0)
+                numbers["advantages"] = self.advantages / scale.unit
         return dataclasses.replace(self, **{name: x.float() for name, x in numbers.items()})
 
     def as_steps(self) -> Batch:

@@ -222,9 +222,10 @@ def give(env: EnvObject, carried: object, seed: int) -> None:
     if any(_attribute(env, name) is ABSENT for name in found):
         env.reset(seed=seed)
     for name, form in found.items():
-        old = _attribute(env, name)
-        if old is ABSENT or encode(_portable(old, name)) != encode(form):
-            vars(_layer(env, name))[name.partition(".")[2]] = _built(old, form)
+        held, attribute = vars(_layer(env, name)), name.partition(".")[2]
+        # what cannot be held any more has no text, and is replaced too
+        if attribute not in held or _text(_layer(env, name), attribute) != str(encode(form)):
+            held[attribute] = _built(held.get(attribute), form)
 
 
 def not_there(env: EnvObject, names: Sequence[str]) -> list[str]:

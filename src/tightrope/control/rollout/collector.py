@@ -209,9 +209,8 @@ class Collector:
                 earlier, begin = [], t + 1
             origin = origins[row]
         layout, carried, lost = environments.action_layout, running.carried, False
-        if (
-            carried is not None and begin
-        ):  # known of the present episodes; workers do not answer after a fault
+        if carried is not None and begin:
+            # known of the present episodes only, and workers do not answer after a fault
             lost = present[row, 0] != origin[0] or (self._broken and environments.backend != "serial")
             carried = None if lost else environments.carried()
         width = rollout.actions.shape[2]
