@@ -33,6 +33,7 @@ Rows = str | Path | Iterable[str | Mapping[str, object] | Sequence[Mapping[str, 
 Item = TypeVar("Item")
 Notify = Callable[[str], None]
 FILES = (".jsonl", ".json", ".csv", ".txt")
+CHATS = ("prompt", "completion", "messages", "chosen", "rejected", "tools")  # columns that may hold messages
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,9 @@ def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
 
     ``source``: a .jsonl, .json (a list), .csv or .txt file (a string a line), the id of a dataset on the hub
     (``id`` or ``id:split``; needs the package datasets), a list of strings, dicts or message lists, or
-    anything that yields dicts, as datasets.Dataset does. Strings stay strings, and a list of messages is read
-    as ``{"prompt": messages}``. ValueError when there is nothing to read, a row is none of these, or a column
-    occurs twice in a file's row or header.
+    anything that yields dicts, as datasets.Dataset does (without the nulls that it puts into chats). Strings
+    stay strings, and a list of messages is read as ``{"prompt": messages}``. ValueError when there is nothing
+    to read, a row is none of these, or a column occurs twice in a file's row or header.
     """
     name = str(source) if isinstance(source, str | Path) else "data"
     if isinstance(source, str | Path):
@@ -72,6 +73,7 @@ def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
         )
     if not isinstance(source, Iterable):
         raise ValueError(f"{name} is {type(source).__name__}; expected a file, a dataset or a list of rows.")
+    arrow = type(source).__module__.partition(".")[0] == "datasets"
     rows: list[Row] = []
     for number, row in enumerate(islice(source, limit)):
         if isinstance(row, list) and row and all(isinstance(message, Mapping) for message in row):
@@ -81,10 +83,23 @@ def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
                 f"{name}[{number}] is {type(row).__name__}; expected a string or a dict of columns, or a "
                 'list of messages like {"role": "user", "content": "Hello"}.'
             )
-        rows.append(row if isinstance(row, str) else dict(row))
+        rows.append(row if isinstance(row, str) else without_nulls(row) if arrow else dict(row))
     if not rows:
         raise ValueError(f"{name} holds no rows.")
     return rows
+
+
+def without_nulls(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of Arrow without the nulls inside its chats: Arrow gives all objects of a column the keys of all
+    others, such as the arguments of other tools.
+    """
+    return {name: _without_nulls(value) if name in CHATS else value for name, value in row.items()}
+
+
+def _without_nulls(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_nulls(part) for key, part in value.items() if part is not None}
+    return [_without_nulls(part) for part in value] if isinstance(value, list) else value
 
 
 def _read_file(path: Path) -> list[Any]:
@@ -173,6 +188,7 @@ def sft_examples(
     eos: int | Sequence[int],
     max_tokens: int,
     on_completions: bool = True,
+    vocabulary: int | None = None,
     notify: Notify = warnings.warn,
 ) -> list[Example]:
     """Examples for supervised fine-tuning.
@@ -181,20 +197,23 @@ def sft_examples(
     messages, and ``{"messages"}``: only completions and assistant turns, or everything with
     ``on_completions`` off. The EOS that closes a text or a reply is learnt, with any PAD; where none
     is written, the first of ``eos`` is appended. Rows over ``max_tokens`` are cut at the end, rows with
-    nothing left to learn are left out, and ``notify`` receives how many. ValueError names the row that
-    is empty or lacks its columns.
+    nothing left to learn are left out, and ``notify`` receives how many; also how many have a prompt that
+    had to be tokenised apart from its reply. ``vocabulary``: how many ids the model knows. ValueError names
+    the row that is empty, lacks its columns, or has a token that the model does not know.
     """
-    encoder, cut = Encoder(tokenizer, eos), 0
+    encoder, cut = Encoder(tokenizer, eos, vocabulary), 0
     examples: list[Example] = []
     for number, row in enumerate(rows):
         columns = {"text": row} if isinstance(row, str) else row
         pieces = formats.supervised(columns, encoder, f"data[{number}]")
         tokens, learn = formats.joined(pieces, everything=not on_completions)
+        encoder.require_known(tokens, f"data[{number}]")
         cut += len(tokens) > max_tokens
         example = Example(tuple(tokens[:max_tokens]), tuple(learn[:max_tokens]))
         if any(example.learn):
             examples.append(example)
     _report(notify, len(rows), len(examples), cut, max_tokens, "nothing to learn")
+    _report_borders(notify, len(rows), encoder)
     return examples
 
 
@@ -204,27 +223,31 @@ def preference_pairs(
     *,
     eos: int | Sequence[int],
     max_tokens: int,
+    vocabulary: int | None = None,
     notify: Notify = warnings.warn,
 ) -> list[Pair]:
     """Pairs for a reward model: ``{"prompt", "chosen", "rejected"}``, or ``{"chosen", "rejected"}`` that both
     contain their prompt; strings or lists of messages.
 
     Each text ends with its EOS, as a sampled response does. Texts over ``max_tokens`` are cut at the end,
-    pairs whose texts are equal (then, or from the start) are left out, and ``notify`` receives how many.
-    ValueError names the row that is empty or lacks its columns.
+    pairs whose texts are equal (then, or from the start) are left out, and ``notify`` receives how many; also
+    how many have a prompt that had to be tokenised apart from its reply. ``vocabulary`` and ValueError as in
+    `sft_examples`.
     """
-    encoder, cut = Encoder(tokenizer, eos), 0
+    encoder, cut = Encoder(tokenizer, eos, vocabulary), 0
     pairs: list[Pair] = []
     for number, row in enumerate(rows):
         columns = {"text": row} if isinstance(row, str) else row
         both = formats.preference(columns, encoder, f"data[{number}]")
         chosen, rejected = (tuple(formats.joined(pieces)[0]) for pieces in both)
+        encoder.require_known((*chosen, *rejected), f"data[{number}]")
         cut += max(len(chosen), len(rejected)) > max_tokens
         chosen, rejected = chosen[:max_tokens], rejected[:max_tokens]
         if chosen != rejected:
             (head, learnt), common = both[0][0], formats.shared(chosen, rejected)
             pairs.append(Pair(chosen, rejected, common if learnt else min(len(head), common)))
     _report(notify, len(rows), len(pairs), cut, max_tokens, "two equal texts")
+    _report_borders(notify, len(rows), encoder)
     return pairs
 
 
@@ -233,6 +256,7 @@ def read_prompts(
     tokenizer: PreTrainedTokenizerBase,
     *,
     max_tokens: int,
+    vocabulary: int | None = None,
     notify: Notify = warnings.warn,
 ) -> list[Prompt]:
     """Prompts to respond to: plain strings, or ``{"prompt"}`` as a string or a list of messages.
@@ -240,9 +264,10 @@ def read_prompts(
     Messages end with the assistant's header, so that the response is its turn. Every other column goes to the
     reward functions. Prompts over ``max_tokens`` lose their beginning (the tokenizer's opening stays, and
     ``shown`` is what is left of a string; a chat is shown whole), and ``notify`` receives how many.
-    ValueError names a row that is empty or has no prompt.
+    ``vocabulary``: how many ids the model knows. ValueError names a row that is empty, has no prompt, or has
+    a token that the model does not know.
     """
-    encoder, cut, chats = Encoder(tokenizer), 0, 0
+    encoder, cut, chats, blank = Encoder(tokenizer, vocabulary=vocabulary), 0, 0, 0
     prompts: list[Prompt] = []
     for number, row in enumerate(rows):
         columns, place = {"prompt": row} if isinstance(row, str) else row, f"data[{number}]"
@@ -251,8 +276,11 @@ def read_prompts(
         shown = formats.read_content(columns, "prompt", place)
         if isinstance(shown, str):
             tokens, opening = encoder.text(shown), encoder.opening[: max_tokens - 1]
+            if shown[-1].isspace():
+                blank += encoder.text(shown + "a")[: len(tokens)] != tokens
         else:
             tokens, opening = encoder.prompt(shown, place, tools=columns.get("tools")), []
+        encoder.require_known(tokens, f"prompt of {place}")
         if not tokens:
             raise ValueError(f"prompt of {place} has no tokens. Take the row out, or fill it in.")
         if len(tokens) > max_tokens:
@@ -266,6 +294,11 @@ def read_prompts(
         whole = f", though {chats} of them are chats, which reward functions are shown whole" if chats else ""
         long = f"{cut} of {len(rows)} prompts have more than {max_tokens} tokens"
         notify(f"{long} and lost their beginning{whole}. Raise max_prompt_tokens to keep them whole.")
+    if blank:
+        notify(
+            f"{blank} of {len(rows)} prompts end with a blank that this tokenizer writes together with the "
+            "word that follows: the model has hardly ever continued such a text. Take the blank out."
+        )
     return prompts
 
 
@@ -283,6 +316,16 @@ def _report(notify: Notify, rows: int, kept: int, cut: int, max_tokens: int, why
         parts.append(f"{rows - kept} of {rows} rows have {why} and were left out")
     if parts:
         notify("; ".join(parts) + "." + (" Raise max_tokens to keep them whole." if cut else ""))
+
+
+def _report_borders(notify: Notify, rows: int, encoder: Encoder) -> None:
+    """Report in how many rows a reply does not begin at a border of the whole text's tokens."""
+    if encoder.crossed:
+        notify(
+            f"{len(encoder.crossed)} of {rows} rows have a prompt whose end this tokenizer writes in another "
+            "way when the reply follows. Their last reply was tokenised apart, so that the prompt has the "
+            "tokens that sampling begins with. Where a prompt ends with a blank, let the reply begin with it."
+        )
 
 
 def hold_out_prompts(prompts: list[Prompt], count: int) -> tuple[list[Prompt], list[Prompt]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -10,22 +10,36 @@ if TYPE_CHECKING:
 
 Messages = list[dict[str, Any]]
 Pieces = list[tuple[list[int], bool]]  # tokens, and whether they are learnt
+Encode = Callable[[str], list[int]]
+Spans = list[tuple[int, int]]  # begin and end, of characters or of tokens
+ANCHORS = (
+    "",
+    "\n",
+    ".",
+    "a",
+    " a",
+)  # what a text may stand behind so that its tokens are those of a continuation
 
 
 class Encoder:
     """A tokenizer, and what it puts before and after a text.
 
     ``eos`` are the ids that end a response; the first is appended where a text does not end with one.
-    Prompt and reply are tokenised apart, at the place where sampling parts them.
+    ``vocabulary``: how many ids the model knows; None: all of the tokenizer. ``crossed``: the places of rows
+    whose reply does not begin at a border of the whole text's tokens.
     """
 
-    def __init__(self, tokenizer: PreTrainedTokenizerBase, eos: int | Sequence[int] = ()) -> None:
-        self.tokenizer = tokenizer
+    def __init__(
+        self, tokenizer: PreTrainedTokenizerBase, eos: int | Sequence[int] = (), vocabulary: int | None = None
+    ) -> None:
+        self.tokenizer, self.vocabulary = tokenizer, vocabulary
         self.eos = (eos,) if isinstance(eos, int) else tuple(eos)
+        self.crossed = set[str]()
         # A probe separates the opening (a BOS, or nothing) from a closing EOS, also where both are one id.
         bare, whole = self.bare("a"), list(tokenizer("a")["input_ids"])
         starts = (i for i in range(len(whole)) if bare and whole[i : i + len(bare)] == bare)
         self.opening = whole[: next(starts, 0)]
+        self.newline = set(self.bare("\n"))
 
     def bare(self, text: str) -> list[int]:
         """The tokens of a text and nothing else."""
@@ -36,21 +50,83 @@ class Encoder:
         tokens = self.bare(text)
         return tokens if tokens[: len(self.opening)] == self.opening else [*self.opening, *tokens]
 
-    def reply(self, prompt: str, completion: str) -> tuple[list[int], list[int]]:
-        """Prompt and completion of plain text: together, as the tokenizer writes them, where that leaves the
-        prompt as it is; apart where a token would span both.
+    def with_replies(self, text: str, replies: Spans, place: str, encode: Encode) -> tuple[list[int], Spans]:
+        """The tokens of a whole text, and where its replies stand in them; ``replies``: spans of characters.
+
+        What stands before a reply should be the tokens of that much of the text alone, as sampling begins
+        with them. It is not where a token reaches across the border, or where the end of the prompt is
+        written in another way when something follows: there the last reply is tokenised apart, and an earlier
+        one is learnt from the first token on that is not the prompt's. Offsets would not show the second,
+        lack blanks (``trim_offsets``), and slow tokenizers have none.
         """
-        before, whole = self.text(prompt), self.text(prompt + completion)
-        apart = whole[: len(before)] != before
-        return before, self.bare(completion) if apart else whole[len(before) :]
+        tokens, found = encode(text), Spans()
+        for start, end in replies:
+            before = encode(text[:start])
+            begin = shared(before, tokens)
+            if begin < len(before):
+                self.crossed.add(place)
+                if (start, end) == replies[-1]:
+                    encode, begin = self._apart(text, start, before, tokens, place), len(before)
+                    tokens = encode(text)
+            until = tokens if end == len(text) else encode(text[:end])
+            found.append((begin, max(begin, shared(until, tokens))))
+        return tokens, found
+
+    def _apart(self, text: str, start: int, before: list[int], whole: list[int], place: str) -> Encode:
+        """How to tokenise ``text`` up to any later character with ``before`` as the tokens up to ``start``.
+
+        The rest is tokenised behind a character that leaves its tokens alone: so no blank comes before its
+        first word, and half a word stays one. The row must still say what its ``whole`` tokens say.
+        """
+        for said in (self._decoded, self._written):
+            for anchor in ANCHORS:
+                head = self.bare(anchor)
+
+                def encode(part: str, anchor: str = anchor, size: int = len(head)) -> list[int]:
+                    return [*before, *self.bare(anchor + part[start:])[size:]]
+
+                alone = self.bare(anchor + text[start:])[: len(head)] == head
+                if alone and said(encode(text)) == said(whole):
+                    return encode
+        raise ValueError(
+            f"{place}: the tokenizer writes the end of the prompt in another way when the reply follows, and "
+            "has no tokens for the reply alone. Part them between two words: a blank belongs to the reply."
+        )
+
+    def _decoded(self, tokens: list[int]) -> str:
+        return str(self.tokenizer.decode(tokens, clean_up_tokenization_spaces=False))
+
+    def _written(self, tokens: list[int]) -> str:
+        """Where a tokenizer has no decoder, decoded tokens stand apart."""
+        return "".join(self.tokenizer.convert_ids_to_tokens(tokens))
+
+    def reply(self, prompt: str, completion: str, place: str = "this row") -> tuple[list[int], list[int]]:
+        """The tokens of a prompt of plain text, and those of its completion."""
+        whole, border = prompt + completion, len(prompt)
+        tokens, [(start, _)] = self.with_replies(whole, [(border, len(whole))], place, self.text)
+        return tokens[:start], tokens[start:]
+
+    def require_known(self, tokens: Sequence[int], place: str) -> None:
+        """ValueError for a token that the model has no id for."""
+        last = max(tokens, default=-1)
+        if self.vocabulary is not None and last >= self.vocabulary:
+            raise ValueError(
+                f"{place} has the token {self.tokenizer.convert_ids_to_tokens(last)!r}, id {last}, but the "
+                f"model has {self.vocabulary} ids. Give it more with "
+                "model.resize_token_embeddings(len(tokenizer)), save both, and give that folder."
+            )
 
     def closing(self, tokens: list[int]) -> int | None:
         """How many tokens there are up to the EOS that closes a reply, it included; None without such an EOS.
 
-        Only blanks may follow it: chat templates write a newline there, which is never sampled.
+        Only blanks may follow it: chat templates write a newline there, which is never sampled, and which
+        some tokenizers do not know.
         """
         last = max((i for i, token in enumerate(tokens) if token in self.eos), default=None)
-        if last is None or str(self.tokenizer.decode(tokens[last + 1 :])).strip():
+        if last is None:
+            return None
+        tail = [token for token in tokens[last + 1 :] if token not in self.newline]
+        if str(self.tokenizer.decode(tail)).strip():
             return None
         return last + 1
 
@@ -73,20 +149,22 @@ class Encoder:
         return encodable(text, f"the chat of {place}")
 
     def chat(self, messages: Messages, place: str, *, first: int = 0, tools: object = None) -> Pieces:
-        """A chat in pieces; assistant turns from message ``first`` on are learnt, up to their EOS."""
-        whole, at = self.render(messages, place, tools=tools), 0
-        pieces: Pieces = []
-        for index, message in enumerate(messages):
-            if message["role"] != "assistant" or index < first:
-                continue
-            start, end = self._turn(messages, index, whole, place, tools)
-            turn = self.bare(whole[start:end])
+        """A chat in pieces; assistant turns from message ``first`` on are learnt, up to their EOS. Its tokens
+        are those of the whole rendered chat.
+        """
+        whole = self.render(messages, place, tools=tools)
+        learnt = [i for i, message in enumerate(messages) if i >= first and message["role"] == "assistant"]
+        turns = [self._turn(messages, index, whole, place, tools) for index in learnt]
+        tokens, spans = self.with_replies(whole, turns, place, self.bare)
+        pieces, at = Pieces(), 0
+        for index, (start, end) in zip(learnt, spans, strict=True):
+            turn = tokens[start:end]
             if index == len(messages) - 1:
                 turn = self.closed(turn)
             cut = self.closing(turn) or len(turn)
-            pieces += [(self.bare(whole[at:start]), False), (turn[:cut], True), (turn[cut:], False)]
+            pieces += [(tokens[at:start], False), (turn[:cut], True), (turn[cut:], False)]
             at = end
-        return [*pieces, (self.bare(whole[at:]), False)]
+        return [*pieces, (tokens[at:], False)]
 
     def _turn(self, messages: Messages, index: int, whole: str, place: str, tools: object) -> tuple[int, int]:
         """Where an assistant turn begins and ends in the chat's text: its header belongs to the prompt."""
@@ -102,7 +180,12 @@ class Encoder:
                 f"{place}: the chat template rewrites earlier turns when message {index} is followed by "
                 "others. Give one row a reply: the messages before it as prompt, the reply as completion."
             )
-        return shared(whole, asked), len(until)
+        start = shared(whole, asked)
+        if start < len(asked):
+            # the header opens something that the reply lacks (a thought), and may share letters with it
+            other = [*messages[:index], {"role": "assistant", "content": "."}]
+            start = min(start, shared(self.render(other, place, tools=tools), asked))
+        return start, len(until)
 
     def prompt(self, messages: Messages, place: str, *, tools: object = None) -> list[int]:
         """A chat up to the assistant's next turn, or up to where a turn that it has begun continues."""
@@ -116,7 +199,7 @@ def supervised(row: Mapping[str, object], encoder: Encoder, place: str) -> Piece
     if has(row, "prompt", "completion"):
         prompt, completion = read_content(row, "prompt", place), read_content(row, "completion", place)
         if isinstance(prompt, str) and isinstance(completion, str):
-            return answered(encoder, prompt, completion)
+            return answered(encoder, prompt, completion, place)
         asked = as_messages(prompt, "user")
         messages = [*asked, *as_messages(completion, "assistant")]
         return encoder.chat(messages, place, first=len(asked), tools=row.get("tools"))
@@ -141,15 +224,15 @@ def preference(row: Mapping[str, object], encoder: Encoder, place: str) -> list[
     if len(texts) == 2 and not isinstance(prompt, list):
         if prompt is None:
             return [[(encoder.closed(encoder.text(text)), True)] for text in texts]
-        return [answered(encoder, prompt, text) for text in texts]
+        return [answered(encoder, prompt, text, place) for text in texts]
     chosen, rejected = (_whole_chat(prompt, as_messages(reply, "assistant")) for reply in replies)
     first = shared(chosen, rejected)
     return [encoder.chat(chat, place, first=first, tools=row.get("tools")) for chat in (chosen, rejected)]
 
 
-def answered(encoder: Encoder, prompt: str, completion: str) -> Pieces:
+def answered(encoder: Encoder, prompt: str, completion: str, place: str) -> Pieces:
     """A prompt, not learnt, and a completion, learnt with its EOS."""
-    before, reply = encoder.reply(prompt, completion)
+    before, reply = encoder.reply(prompt, completion, place)
     return [(before, False), (encoder.closed(reply), True)]
 
 
