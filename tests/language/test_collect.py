@@ -68,7 +68,7 @@ def test_a_value_is_the_critics_of_the_text_before_the_token(folder, critic, lay
 
 def test_responses_of_different_lengths_have_their_score_at_their_own_end(folder):
     """Rewards by hand, advantages as brute-force sums, with a non-trivial critic."""
-    roles, experience = experienced(settings(folder))
+    roles, experience = experienced(settings(folder, temperature=0.7))
     rewards = rewards_of(experience, SCORES, roles.settings, 0.05).rewards
     batch = batch_of(experience, rewards, EVERY, roles.settings)
     lengths = experience.responses.mask.sum(1).tolist()

@@ -14,9 +14,9 @@ import torch
 from tightrope.language.alignment.samples import read_samples
 from tightrope.language.data.batching import pad_left
 from tightrope.language.data.examples import Prompt, read_prompts
-from tightrope.language.generation.distribution import Sampling
+from tightrope.language.generation.distribution import sampling_of
 from tightrope.language.generation.sample import sample
-from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, quiet_libraries
+from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, quiet_libraries
 from tightrope.language.model.packaged import find_model
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.folders import require_kind
@@ -36,6 +36,8 @@ def sample_run(
     ``prompt``: texts or message lists; by default ``count`` different ones that the run itself answered.
     ``seed`` of sampling: by default the run's + 1. Raises ValueError where there is no finished run.
     """
+    from transformers import AutoConfig
+
     path = Path(path)
     run = Run.open(path)
     require_kind(path, run.settings, "align")
@@ -50,7 +52,8 @@ def sample_run(
     tokenizer = load_tokenizer(str(path / "model"))
     seed = settings.seed + 1 if seed is None else seed
     rows = [{"prompt": text} for text in asked]
-    prompts = read_prompts(rows, tokenizer, max_tokens=settings.max_prompt_tokens)
+    vocabulary = pretrained(AutoConfig, path / "model").get_text_config().vocab_size
+    prompts = read_prompts(rows, tokenizer, max_tokens=settings.max_prompt_tokens, vocabulary=vocabulary)
     texts = {
         name: _responses(folder, prompts, settings, seed)
         for name, folder in (("before", find_model(settings.model)), ("after", str(path / "model")))
@@ -76,7 +79,10 @@ def _responses(folder: str, prompts: Sequence[Prompt], settings: AlignSettings, 
     model, tokenizer = load_causal(folder), load_tokenizer(folder)
     tokens, real = pad_left([prompt.tokens for prompt in prompts])
     stops = eos_ids(model, tokenizer)
-    sampling = Sampling(settings.temperature, settings.top_k, stops if settings.ignore_eos else ())
+    sampling = sampling_of(
+        model, tokenizer, stops,
+        temperature=settings.temperature, top_k=settings.top_k, ignore_eos=settings.ignore_eos,
+    )  # fmt: skip
     numbers = np.random.default_rng([seed, 8]).random((len(prompts), settings.max_new_tokens))
     found = sample(model, tokens, real, sampling, torch.from_numpy(numbers), stops)
     rows = zip(found.tokens, found.mask, strict=True)

@@ -14,10 +14,10 @@ from tightrope.algorithms.optimise import make_optimiser
 from tightrope.findings import Finding
 from tightrope.language.alignment.experience import batch_of, gather, rewards_of
 from tightrope.language.data.batching import pad_left, pad_right
-from tightrope.language.data.examples import Prompt
+from tightrope.language.data.examples import read_prompts
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import log_ratio_limit
-from tightrope.language.model.load import quiet_libraries
+from tightrope.language.model.load import known_ids, quiet_libraries, unreadable, unwritable
 from tightrope.language.policy.policy_model import Experience, PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.reward.functions import Scores
@@ -35,12 +35,16 @@ def check_model(model: str, dtype: str = "float32") -> list[Finding]:
         max_prompt_tokens=16, update=RLHFSettings(minibatch_size=8, num_epochs=1, normalise_advantages=False),
     )  # fmt: skip
     roles = make_roles(settings, notify=lambda text: None)
-    prompts = [Prompt(tuple(roles.tokenizer(text)["input_ids"][:16]), text, {}) for text in WORDS]
+    prompts = read_prompts(
+        list(WORDS), roles.tokenizer, max_tokens=16, vocabulary=known_ids(roles.model),
+        notify=lambda text: None,
+    )  # fmt: skip
     experience = gather(roles, prompts, 0, 0, 2)
     scores = Scores(np.linspace(-1, 1, 8), np.ones(8, bool), {}, {}, {})
     rewards = rewards_of(experience, scores, settings, settings.kl_beta).rewards
     batch = batch_of(experience, rewards, torch.ones(8, dtype=torch.bool), settings)
     return [
+        _vocabulary(roles),
         _same_logits(roles, experience),
         _same_policy(roles, experience),
         _reference(experience),
@@ -53,6 +57,22 @@ def check_model(model: str, dtype: str = "float32") -> list[Finding]:
         _returns(experience, rewards, batch),
         _trunk(roles),
     ]
+
+
+def _vocabulary(roles: Roles) -> Finding:
+    """Tokens without an embedding do no harm while no text has them; those that the chat template or the
+    tokenizer itself writes are in every text.
+    """
+    model, tokenizer, size = roles.model, roles.tokenizer, known_ids(roles.model)
+    beyond = [name for name, token in tokenizer.get_vocab().items() if token >= size]
+    written = f"{tokenizer.chat_template} {' '.join(map(str, tokenizer.all_special_tokens))}"
+    seen = f"{size} ids, {len(unwritable(model, tokenizer))} of which are never sampled: no token has them"
+    return Finding(
+        "every token of the tokenizer has an embedding", not any(name in written for name in beyond),
+        f"{seen}. {unreadable(model, tokenizer)}".rstrip(". "),
+        "Texts with the tokenizer's own tokens cannot be read. Call model.resize_token_embeddings("
+        "len(tokenizer)), save both, and give that folder.",
+    )  # fmt: skip
 
 
 def _limit(roles: Roles) -> float:

@@ -33,6 +33,7 @@ from tightrope.language.alignment.samples import sample_rows
 from tightrope.language.data.examples import Prompt, Rows, hold_out_prompts, read_prompts, read_rows
 from tightrope.language.generation.sample import log_ratio_limit
 from tightrope.language.model.architecture import context_length
+from tightrope.language.model.load import known_ids
 from tightrope.language.model.packaged import find_model
 from tightrope.language.model.saving import save_model
 from tightrope.language.policy.policy_model import Experience, FirstPass, PolicyModel
@@ -158,11 +159,10 @@ class Trainer:
                 f"max_prompt_tokens {settings.max_prompt_tokens} + max_new_tokens {settings.max_new_tokens} "
                 f"exceed the model's context of {limit} tokens. Choose less of either."
             )
-        rows, longest = read_rows(source), settings.max_prompt_tokens
-        found = read_prompts(rows, self.roles.tokenizer, max_tokens=longest, notify=self.listeners.warn)
-        if not found:
-            raise ValueError("There are no prompts. Give a list of texts, or a file with a 'prompt' a row.")
-        return found
+        return read_prompts(
+            read_rows(source), self.roles.tokenizer, max_tokens=settings.max_prompt_tokens,
+            vocabulary=known_ids(self.roles.model), notify=self.listeners.warn,
+        )  # fmt: skip
 
     # ---------------------------------------------------------------------------------------------- the run
 

@@ -14,6 +14,7 @@ from tightrope.algorithms.batch import Batch
 from tightrope.language.data.batching import Example, pad_right
 from tightrope.language.data.examples import Notify, read_rows, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
+from tightrope.language.model.load import known_ids
 from tightrope.language.policy.roles import Roles
 from tightrope.language.settings import AlignSettings
 
@@ -34,8 +35,9 @@ class Pretraining:
         assert settings.ptx_data is not None  # ptx_weight needs it
         rows = read_rows(settings.ptx_data)
         examples = sft_examples(
-            rows, roles.tokenizer, eos=roles.eos, max_tokens=longest, on_completions=False, notify=notify
-        )
+            rows, roles.tokenizer, eos=roles.eos, max_tokens=longest, on_completions=False,
+            vocabulary=known_ids(roles.model), notify=notify,
+        )  # fmt: skip
         return cls(roles, examples, settings.ptx_per_response, settings.seed)
 
     def draw(self, minibatch: Batch) -> Batch:

@@ -7,14 +7,19 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.architecture import FACTOR
+from tightrope.language.model.architecture import FACTOR, parts
+from tightrope.language.model.load import unwritable
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
 CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 
@@ -28,6 +33,37 @@ class Sampling:
     temperature: float = 1.0
     top_k: int = 0
     forbidden: tuple[int, ...] = ()
+
+    def choices(self, size: int) -> int:
+        """How many of ``size`` ids top-k chooses among."""
+        return min(self.top_k, size - len(self.forbidden))
+
+
+def sampling_of(
+    model: PreTrainedModel,
+    tokenizer: PreTrainedTokenizerBase,
+    eos: tuple[int, ...],
+    *,
+    temperature: float,
+    top_k: int,
+    ignore_eos: bool,
+) -> Sampling:
+    """How tokens of a model are drawn, in sampling and in all that is computed for them: never one of its ids
+    that the tokenizer does not have, and with ``ignore_eos`` no EOS. ValueError where no response could end.
+    """
+    strangers = unwritable(model, tokenizer)
+    stops = {token for token in eos if token < len(parts(model).head.weight)}
+    if not stops.difference(strangers):
+        raise ValueError(
+            f"The model ends responses with {', '.join(map(str, eos))}, which its tokenizer does not have: "
+            "none could end. Set eos_token_id in generation_config.json to one of the tokenizer's ids."
+        )
+    return Sampling(temperature, top_k, tuple(sorted({*strangers, *(stops if ignore_eos else ())})))
+
+
+@functools.lru_cache(maxsize=8)
+def _places(ids: tuple[int, ...], device: torch.device) -> Tensor:
+    return torch.tensor(ids, device=device)
 
 
 def shape_logits(
@@ -43,7 +79,7 @@ def shape_logits(
     if sampling.temperature != 1.0:
         shaped.div_(sampling.temperature)
     if sampling.forbidden:
-        shaped.index_fill_(1, torch.tensor(sampling.forbidden, device=shaped.device), -torch.inf)
+        shaped.index_fill_(1, _places(sampling.forbidden, shaped.device), -torch.inf)
     return shaped if support is None else shaped.gather(1, support)
 
 
@@ -231,7 +267,7 @@ class _Chunks:
         p /= total
         logs -= total.log()
         if self.sampling.forbidden:  # 0 log 0 is 0
-            forbidden = torch.tensor(self.sampling.forbidden, device=logs.device)
+            forbidden = _places(self.sampling.forbidden, logs.device)
             logs.index_fill_(1, forbidden, 0.0) if allowed is None else logs.masked_fill_(
                 logs == -torch.inf, 0.0
             )

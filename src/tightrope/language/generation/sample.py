@@ -38,7 +38,7 @@ class Responses:
     """B responses of at most R tokens: ``tokens`` and ``logp`` [B, R], ``mask`` [B, R] True for real tokens.
 
     ``ended`` [B]: the response closed itself with an EOS (which counts as a token of it). ``support``
-    [B, R, k]: the ids among which top-k drew, k at most the vocabulary; None without top-k.
+    [B, R, k]: the ids among which top-k drew, k at most those that may be drawn; None without top-k.
     """
 
     tokens: Tensor
@@ -87,7 +87,7 @@ def sample(
     tokens = torch.zeros(rows, columns, dtype=torch.int64, device=device)
     mask = torch.zeros(rows, columns, dtype=torch.bool, device=device)
     logp = torch.zeros(rows, columns, device=device)
-    shape = (rows, columns, min(sampling.top_k, len(head.weight)))  # as many as `draw` has to choose among
+    shape = (rows, columns, sampling.choices(len(head.weight)))
     support = torch.zeros(shape, dtype=torch.int64, device=device) if sampling.top_k else None
     ended = torch.zeros(rows, dtype=torch.bool, device=device)
     stops = torch.tensor(eos, device=device)
@@ -124,7 +124,7 @@ def draw(
     """One token per row from hidden states [N, d]: ids, log-probabilities [N], and with top-k its support."""
     logits, support = next_logits(hidden, head, sampling), None
     if sampling.top_k:
-        logits, support = logits.topk(min(sampling.top_k, logits.shape[1]), dim=1)
+        logits, support = logits.topk(sampling.choices(logits.shape[1]), dim=1)
     logs = logits.log_softmax(1)
     steps = logs.double().exp().cumsum(1)
     # the last step may round to less than 1, and what follows the last possible token must not be reached

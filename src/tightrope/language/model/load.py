@@ -122,6 +122,33 @@ def eos_ids(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> tuple
     )
 
 
+def known_ids(model: Any) -> int:
+    """How many ids a model of transformers reads: the rows of its embedding."""
+    return int(model.get_input_embeddings().weight.shape[0])
+
+
+def unreadable(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> str:
+    """A sentence that names the tokens without an embedding, added ones as a rule; empty without any."""
+    size = known_ids(model)
+    names = [repr(name) for name, token in sorted(tokenizer.get_vocab().items()) if token >= size]
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return (
+        f"The tokenizer has tokens beyond the {size} ids of the model: {', '.join(names[:5])}{more}. A text "
+        "that holds one is refused."
+        if names
+        else ""
+    )
+
+
+def unwritable(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
+    """The ids of the head that no text has: beyond the tokenizer's, where the vocabulary is padded, or unused
+    by it. Nobody can read them, so they are never drawn.
+    """
+    size = known_ids(model)
+    known = {token for token in tokenizer.get_vocab().values() if token < size}
+    return tuple(token for token in range(len(parts(model).head.weight)) if token not in known)
+
+
 def pretrained(kind: Any, folder: str | Path, **options: object) -> Any:
     """``kind.from_pretrained(folder)`` for any of transformers' Auto classes: a folder or a hub id.
 

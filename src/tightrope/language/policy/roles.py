@@ -18,11 +18,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from tightrope.language.generation.distribution import Sampling, token_statistics
+from tightrope.language.generation.distribution import Sampling, sampling_of, token_statistics
 from tightrope.language.memory import job_of, require_memory, reward_model_bytes
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import parameter_counts, parts
-from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, require_device
+from tightrope.language.model.load import (
+    eos_ids,
+    load_causal,
+    load_tokenizer,
+    pretrained,
+    require_device,
+    unreadable,
+)
 from tightrope.language.model.packaged import find_model
 from tightrope.language.model.saving import load_adapter
 from tightrope.language.model.trunk import Role, Trunk
@@ -98,8 +105,14 @@ class Roles:
             if trunk.cut
             else ""
         )
+        never = len(self.sampling.forbidden)
         return [
             f"policy: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained{shared}",
+            *(
+                [f"{never} of the model's ids are never sampled: the tokenizer does not have them"]
+                if never
+                else []
+            ),
             f"critic: {settings.critic}; KL: {settings.kl}, kl_beta {settings.kl_beta:g}",
         ]
 
@@ -130,6 +143,8 @@ def make_roles(
     _require_memory(folder, settings, kind, notify, own_reward)
     tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
     stops, cut = eos_ids(model, tokenizer), 0
+    if strangers := unreadable(model, tokenizer):
+        notify(strangers)
     if settings.tune == "lora":
         layers = lora.top_layers(model, settings.lora_layers)
         cut = layers[0]
@@ -155,7 +170,10 @@ def make_roles(
         head = nn.Linear(model.config.hidden_size, 1).to(device)
         nn.init.zeros_(head.weight)  # the first values are 0 for any hidden state
         nn.init.zeros_(head.bias)
-    sampling = Sampling(settings.temperature, settings.top_k, stops if settings.ignore_eos else ())
+    sampling = sampling_of(
+        model, tokenizer, stops,
+        temperature=settings.temperature, top_k=settings.top_k, ignore_eos=settings.ignore_eos,
+    )  # fmt: skip
     return Roles(tokenizer, policy, reference, critic, head, settings, sampling, stops)
 
 

@@ -14,7 +14,7 @@ from tightrope.algorithms.descent import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions
 from tightrope.language.model import lora
-from tightrope.language.model.load import read_metadata, read_tensors, weights_fingerprint
+from tightrope.language.model.load import known_ids, read_metadata, read_tensors, weights_fingerprint
 from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.call import Fault, RewardError, RewardFunction
@@ -232,6 +232,13 @@ def _same_tokens(model: RewardModel, roles: Roles, folder: Path) -> None:
         raise ValueError(
             f"The reward model {folder} reads {len(theirs)} tokens, the policy writes {len(ours)} others. "
             "Wrap it in a reward function of the text, or train it from the policy's own model."
+        )
+    strange = [token for token in ours.values() if known_ids(model.base) <= token < known_ids(roles.model)]
+    if strange:
+        raise ValueError(
+            f"The reward model {folder} reads {known_ids(model.base)} ids, the policy also writes "
+            f"{roles.tokenizer.convert_ids_to_tokens(min(strange))!r}, id {min(strange)}. Wrap it in a "
+            "reward function of the text, or train it from the policy's own model."
         )
 
 

@@ -22,7 +22,7 @@ from tightrope.language.data.batching import pad_right
 from tightrope.language.data.examples import Pair, Rows, preference_pairs, read_rows, sft_examples
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import parts
-from tightrope.language.model.load import weights_fingerprint, without_weights
+from tightrope.language.model.load import known_ids, weights_fingerprint, without_weights
 from tightrope.language.model.saving import save_adapter
 from tightrope.language.reward.model import SHIFT, RewardModel
 from tightrope.language.settings import RewardSettings
@@ -196,7 +196,10 @@ def _data(
     settings: RewardSettings, loaded: Loaded, given: Mapping[str, Rows | None], listeners: Listeners
 ) -> tuple[list[Pair], list[Pair], list[tuple[int, ...]]]:
     """Pairs to train on, pairs held out (whole prompts, where there are many), and texts to normalise on."""
-    reading: dict[str, Any] = {"eos": loaded.eos, "max_tokens": settings.max_tokens, "notify": listeners.warn}
+    reading: dict[str, Any] = {
+        "eos": loaded.eos, "max_tokens": settings.max_tokens, "vocabulary": known_ids(loaded.model),
+        "notify": listeners.warn,
+    }  # fmt: skip
     pairs, held = examples_of(
         settings,
         given,

@@ -19,6 +19,7 @@ from tightrope.language.model.load import (
     load_tokenizer,
     pretrained,
     require_device,
+    unreadable,
     without_dropout,
 )
 from tightrope.language.model.packaged import find_model
@@ -63,6 +64,8 @@ def prepared(
     with threads(settings.threads), signals.stoppable():
         _require_memory(settings, given, listeners)
         loaded = load_for_training(settings, adapter, given)
+        if strangers := unreadable(loaded.model, loaded.tokenizer):
+            listeners.info(strangers)
         with lora.using(loaded.model, loaded.adapter):
             yield loaded
 

@@ -16,6 +16,7 @@ from tightrope.language.data.batching import Example, Packed, attention_of, coll
 from tightrope.language.data.examples import Row, Rows, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.model.architecture import attention_window, parts
+from tightrope.language.model.load import known_ids
 from tightrope.language.model.saving import save_model
 from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.fit import Objective, Stage, micro_batches, resume_stage, train_stage
@@ -171,6 +172,7 @@ def _rows(
             eos=loaded.eos,
             max_tokens=settings.max_tokens,
             on_completions=settings.on_completions,
+            vocabulary=known_ids(loaded.model),
             notify=listeners.warn,
         )
 
