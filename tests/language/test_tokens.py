@@ -1,5 +1,5 @@
-"""Tokens are the tokenizer's: whole chats tokenised once, borders where sampling parts them, and no id that the
-tokenizer or the model does not have.
+"""Tokens are the tokenizer's: whole chats tokenised once, borders where sampling parts them, and no id that
+only one of tokenizer and model has.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from tightrope.language import align
 from tightrope.language.alignment.experience import gather
 from tightrope.language.data.examples import preference_pairs, read_prompts, read_rows, sft_examples
 from tightrope.language.data.formats import Encoder
-from tightrope.language.generation.distribution import Sampling, sampling_of, token_statistics
+from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import draw
-from tightrope.language.model.load import known_ids, unwritable
+from tightrope.language.model.load import known_ids, never_drawn, unwritable
 from tightrope.language.policy.roles import make_roles
 from tightrope.language.selfcheck import check_model
 from tightrope.language.settings import AlignSettings, RewardSettings, SFTSettings
@@ -130,8 +130,8 @@ def blank(made, tokens: list[int]) -> bool:
 
 
 def check(made, eos: int, chat: list[dict], prompts: int) -> bool:
-    """Whether this chat has a token that reaches from a prompt into a reply; that it has the template's tokens
-    up to there, and begins with the prompt of alignment.
+    """Whether this chat is told to have no border before a reply. Else it has the template's tokens; always
+    it begins with the prompt of alignment, of ``prompts`` messages.
     """
     heard: list[str] = []
     (example,) = sft_examples([{"messages": chat}], made, eos=eos, max_tokens=9999, notify=heard.append)
@@ -142,7 +142,7 @@ def check(made, eos: int, chat: list[dict], prompts: int) -> bool:
     begin = len(asked.tokens)
     assert tuple(own[:begin]) == asked.tokens
     assert all(example.learn[begin:]) and not example.learn[begin - 1]
-    assert heard or theirs[: len(own)] == own and blank(made, theirs[len(own) :])
+    assert heard or (theirs[: len(own)] == own and blank(made, theirs[len(own) :]))
     said, wanted = made.decode(own), made.decode(theirs)
     assert wanted.startswith(said) and blank(made, made(wanted.removeprefix(said))["input_ids"])
     return bool(heard)
@@ -341,7 +341,7 @@ def test_an_id_outside_the_tokenizer_is_never_sampled_and_in_no_support():
     head, hidden = model.get_output_embeddings(), torch.randn(500, 32)
     numbers = torch.rand(500, dtype=torch.float64)
     for k, size in ((0, 0), (5, 5), (99, 60)):
-        sampling = sampling_of(model, made, (3,), temperature=1.0, top_k=k, ignore_eos=False)
+        sampling = Sampling(1.0, k, never_drawn(model, made, (3,), ignore_eos=False))
         tokens, logp, support = draw(hidden, head, sampling, numbers)
         assert not torch.isin(tokens, torch.tensor(strangers)).any()
         if k:
@@ -357,10 +357,9 @@ def test_a_hole_in_the_tokenizers_ids_and_a_head_wider_than_the_embedding_count_
     assert unwritable(model, made) == (17,)
     model.lm_head = torch.nn.Linear(32, 66, bias=False)
     assert unwritable(model, made) == (17, 64, 65)
-    sampling = sampling_of(model, made, (3, 99), temperature=1.0, top_k=0, ignore_eos=True)
-    assert sampling.forbidden == (3, 17, 64, 65)
+    assert never_drawn(model, made, (3, 99), ignore_eos=True) == (3, 17, 64, 65)
     with pytest.raises(ValueError, match=r"ends responses with 17, 99, which its tokenizer does not have"):
-        sampling_of(model, made, (17, 99), temperature=1.0, top_k=0, ignore_eos=False)
+        never_drawn(model, made, (17, 99), ignore_eos=False)
 
 
 @pytest.mark.parametrize("top_k", [0, 7, 64])
@@ -388,9 +387,6 @@ def test_sampling_update_and_exact_kl_are_of_the_tokenizers_ids(tmp_path, top_k)
     with torch.no_grad():
         logs = []
         for role in (roles.policy, roles.reference):
-            states = (
-                role.hidden(found.tokens, found.real)[:, 7 - 8 - mask.shape[1] + 1 : -1] if False else None
-            )
             hidden = role.hidden(found.tokens, found.real)[:, -mask.shape[1] - 1 : -1]
             logs.append(roles.trunk.parts.head(hidden).div(0.8)[..., :60])
     if top_k == 7:

@@ -14,9 +14,16 @@ import torch
 from tightrope.language.alignment.samples import read_samples
 from tightrope.language.data.batching import pad_left
 from tightrope.language.data.examples import Prompt, read_prompts
-from tightrope.language.generation.distribution import sampling_of
+from tightrope.language.generation.distribution import Sampling
 from tightrope.language.generation.sample import sample
-from tightrope.language.model.load import eos_ids, load_causal, load_tokenizer, pretrained, quiet_libraries
+from tightrope.language.model.load import (
+    eos_ids,
+    load_causal,
+    load_tokenizer,
+    never_drawn,
+    pretrained,
+    quiet_libraries,
+)
 from tightrope.language.model.packaged import find_model
 from tightrope.language.settings import AlignSettings
 from tightrope.runs.folders import require_kind
@@ -79,10 +86,8 @@ def _responses(folder: str, prompts: Sequence[Prompt], settings: AlignSettings, 
     model, tokenizer = load_causal(folder), load_tokenizer(folder)
     tokens, real = pad_left([prompt.tokens for prompt in prompts])
     stops = eos_ids(model, tokenizer)
-    sampling = sampling_of(
-        model, tokenizer, stops,
-        temperature=settings.temperature, top_k=settings.top_k, ignore_eos=settings.ignore_eos,
-    )  # fmt: skip
+    never = never_drawn(model, tokenizer, stops, ignore_eos=settings.ignore_eos)
+    sampling = Sampling(settings.temperature, settings.top_k, never)
     numbers = np.random.default_rng([seed, 8]).random((len(prompts), settings.max_new_tokens))
     found = sample(model, tokens, real, sampling, torch.from_numpy(numbers), stops)
     rows = zip(found.tokens, found.mask, strict=True)

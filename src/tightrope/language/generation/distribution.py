@@ -10,16 +10,12 @@ import dataclasses
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.architecture import FACTOR, parts
-from tightrope.language.model.load import unwritable
-
-if TYPE_CHECKING:
-    from transformers import PreTrainedModel, PreTrainedTokenizerBase
+from tightrope.language.model.architecture import FACTOR
 
 CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 
@@ -37,28 +33,6 @@ class Sampling:
     def choices(self, size: int) -> int:
         """How many of ``size`` ids top-k chooses among."""
         return min(self.top_k, size - len(self.forbidden))
-
-
-def sampling_of(
-    model: PreTrainedModel,
-    tokenizer: PreTrainedTokenizerBase,
-    eos: tuple[int, ...],
-    *,
-    temperature: float,
-    top_k: int,
-    ignore_eos: bool,
-) -> Sampling:
-    """How tokens of a model are drawn, in sampling and in all that is computed for them: never one of its ids
-    that the tokenizer does not have, and with ``ignore_eos`` no EOS. ValueError where no response could end.
-    """
-    strangers = unwritable(model, tokenizer)
-    stops = {token for token in eos if token < len(parts(model).head.weight)}
-    if not stops.difference(strangers):
-        raise ValueError(
-            f"The model ends responses with {', '.join(map(str, eos))}, which its tokenizer does not have: "
-            "none could end. Set eos_token_id in generation_config.json to one of the tokenizer's ids."
-        )
-    return Sampling(temperature, top_k, tuple(sorted({*strangers, *(stops if ignore_eos else ())})))
 
 
 @functools.lru_cache(maxsize=8)

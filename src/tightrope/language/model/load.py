@@ -149,6 +149,22 @@ def unwritable(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> tu
     return tuple(token for token in range(len(parts(model).head.weight)) if token not in known)
 
 
+def never_drawn(
+    model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase, eos: tuple[int, ...], *, ignore_eos: bool
+) -> tuple[int, ...]:
+    """The ids that have probability 0, in sampling and in all that is computed for samples: those that are
+    `unwritable`, and with ``ignore_eos`` every EOS. ValueError where no response could end.
+    """
+    strangers = unwritable(model, tokenizer)
+    stops = {token for token in eos if token < len(parts(model).head.weight)}
+    if not stops.difference(strangers):
+        raise ValueError(
+            f"The model ends responses with {', '.join(map(str, eos))}, which its tokenizer does not have: "
+            "none could end. Set eos_token_id in generation_config.json to one of the tokenizer's ids."
+        )
+    return tuple(sorted(stops.union(strangers) if ignore_eos else strangers))
+
+
 def pretrained(kind: Any, folder: str | Path, **options: object) -> Any:
     """``kind.from_pretrained(folder)`` for any of transformers' Auto classes: a folder or a hub id.
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from tightrope.language.generation.distribution import Sampling, sampling_of, token_statistics
+from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.memory import job_of, require_memory, reward_model_bytes
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import parameter_counts, parts
@@ -26,9 +26,11 @@ from tightrope.language.model.load import (
     eos_ids,
     load_causal,
     load_tokenizer,
+    never_drawn,
     pretrained,
     require_device,
     unreadable,
+    unwritable,
 )
 from tightrope.language.model.packaged import find_model
 from tightrope.language.model.saving import load_adapter
@@ -105,7 +107,7 @@ class Roles:
             if trunk.cut
             else ""
         )
-        never = len(self.sampling.forbidden)
+        never = len(unwritable(self.model, self.tokenizer))
         return [
             f"policy: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained{shared}",
             *(
@@ -170,10 +172,8 @@ def make_roles(
         head = nn.Linear(model.config.hidden_size, 1).to(device)
         nn.init.zeros_(head.weight)  # the first values are 0 for any hidden state
         nn.init.zeros_(head.bias)
-    sampling = sampling_of(
-        model, tokenizer, stops,
-        temperature=settings.temperature, top_k=settings.top_k, ignore_eos=settings.ignore_eos,
-    )  # fmt: skip
+    never = never_drawn(model, tokenizer, stops, ignore_eos=settings.ignore_eos)
+    sampling = Sampling(settings.temperature, settings.top_k, never)
     return Roles(tokenizer, policy, reference, critic, head, settings, sampling, stops)
 
 
