@@ -78,7 +78,7 @@ GOOD = [{"prompt": text, "answer": text} for text in ("ab", "cd", "efg")]
         (
             GOOD,
             "good",
-            ["--learning-rate", "1e9"],
+            ["--learning-rate", "1e30"],
             ["expected a finite number", "not taken", "learning rate"],
         ),
         (GOOD, "raises", [], ["'raises' raised KeyError", "line 4 of mine.py"]),
