@@ -12,13 +12,8 @@ Messages = list[dict[str, Any]]
 Pieces = list[tuple[list[int], bool]]  # tokens, and whether they are learnt
 Encode = Callable[[str], list[int]]
 Spans = list[tuple[int, int]]  # begin and end, of characters or of tokens
-ANCHORS = (
-    "",
-    "\n",
-    ".",
-    "a",
-    " a",
-)  # what a text may stand behind so that its tokens are those of a continuation
+# what a text may stand behind, so that it gets the tokens of a continuation
+ANCHORS = ("", "\n", ".", "a", " a")
 
 
 class Encoder:
