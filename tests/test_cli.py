@@ -231,6 +231,7 @@ def test_the_settings_of_another_command_are_refused(
         ({"data": "<list>"}, "--data FILE", "rows.jsonl"),
         ({"reward": "score"}, "--reward FILE.py:function", "length"),
         ({"reward": "mine.py:score"}, "--reward mine.py:score", "mine.py:score"),
+        ({"reward": "mine.py:score=0.5"}, "--reward mine.py:score=0.5", "length=2"),
         ({"reward": "x.py:f; rm -r ~"}, "--reward FILE.py:function", "length"),  # no file writes commands
         ({"gold": "mine.py:score"}, "--gold mine.py:score", "none"),
     ],
@@ -399,7 +400,7 @@ def test_every_peer_name_leads_to_a_real_flag() -> None:
         (["record", "run", "--seed", "-3"], ["at least 0"]),
         (["sample", "run", "--count", "0"], ["--count", "at least 1"]),
         (["sample", "run", "--recorded", "--count=-3"], ["--count", "at least 1"]),
-        (["align", "--reward", "length", "--reward", "gold.py:r"], ["--reward was given twice"]),
+        (["align", "--gold", "length", "--gold", "gold.py:r"], ["--gold was given twice"]),
         (["train", "X", "--num_envs=2", "--num-envs", "3"], ["--num-envs was given twice"]),
         (["train", "X", "--shared", "--no-shared"], ["--shared and --no-shared was given twice"]),
         (["sft", "--settings", "nowhere"], ["nowhere", "no such file"]),
@@ -751,3 +752,37 @@ def test_every_view_has_lines_and_a_panel(name: str) -> None:
         ]
         assert all(cell in text for cell in cells), text
         assert "a fact" in stream.getvalue() and view.counted in stream.getvalue()
+
+
+@pytest.mark.parametrize("width", [80, 60, 40])
+@pytest.mark.parametrize("name", VIEWS)
+def test_the_panel_is_whole_in_any_width_and_there_before_the_run(
+    name: str, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import io
+    import re
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+        def text(self) -> str:
+            return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]|\r", "", self.getvalue())
+
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("TERM", "xterm-256color")
+    view, stream = VIEWS[name], Terminal()
+    with display.Display(view, stream, live=True, title="tightrope align · runs/sft") as shown:
+        first = stream.text()
+        assert "tightrope align" in first and "loading" in first
+        shown(Started("run", SETTINGS | {"model": "a/very/long/name/of/a/model" * 3}, 0, 4_000_000, ()))
+        values = {metric: 1234.5 for column in view.columns for metric in column.metrics}
+        for step in range(1, 50):
+            shown(Updated(step * 80_000, 4_000_000, 1.0, values))
+        shown(Finished({}))
+    last = stream.text().rpartition("╭")[2]
+    cells = [column.form(*(1234.5 for _ in column.metrics)) for column in view.columns]
+    shortest = ("3,920,000 of 4,000,000", "98 %", "left", *cells)
+    assert all(cell in last for cell in shortest), last
+    plain = [line for line in last.splitlines() if line.startswith("│")]
+    assert all(len(line) <= width and line.endswith("│") for line in plain), last

@@ -44,7 +44,8 @@ MAY_IMPORT = {
     "language.memory": CORE | {"language.model", "language.generation", "language.settings"},
     "language.policy": CORE
     | {"language.settings", *(f"language.{part}" for part in ("data", "model", "generation", "memory"))},
-    "language.reward": CORE | {*(f"language.{part}" for part in ("data", "model", "generation", "policy"))},
+    "language.reward": CORE
+    | {"language.settings", *(f"language.{part}" for part in ("data", "model", "generation", "policy"))},
     "language.supervised": CORE
     | {"training", "language.settings"}
     | {f"language.{part}" for part in ("data", "model", "generation", "memory", "reward")},

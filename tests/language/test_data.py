@@ -106,13 +106,15 @@ def test_lists_and_other_iterables_of_rows():
 def test_a_dataset_is_read_by_its_id(monkeypatch):
     asked = []
 
-    def load_dataset(name, split):
-        asked.append((name, split))
+    def load_dataset(path, name, split):
+        asked.append((path, split))
         return [{"text": "a"}]
 
-    monkeypatch.setitem(
-        sys.modules, "datasets", SimpleNamespace(__version__="4.0.0", load_dataset=load_dataset)
-    )
+    new = {"load_dataset": load_dataset, "logging": SimpleNamespace(get_verbosity=lambda: 30)}
+    new["logging"].set_verbosity = new["logging"].set_verbosity_error = lambda *level: None
+    for word in ("are_progress_bars_disabled", "disable_progress_bars", "enable_progress_bars"):
+        new[word] = lambda: True
+    monkeypatch.setitem(sys.modules, "datasets", SimpleNamespace(__version__="4.0.0", **new))
     assert read_rows("owner/name") == read_rows("owner/name:test") == [{"text": "a"}]
     assert asked == [("owner/name", "train"), ("owner/name", "test")]
     old = SimpleNamespace(__version__="3.6.0", load_dataset=load_dataset)  # it may run a dataset's script
@@ -121,7 +123,7 @@ def test_a_dataset_is_read_by_its_id(monkeypatch):
         read_rows("owner/name")
     assert len(asked) == 2
     monkeypatch.setitem(sys.modules, "datasets", None)
-    with pytest.raises(ValueError, match=r"no file 'owner/name'.*pip install datasets"):
+    with pytest.raises(ValueError, match=r"no text file 'owner/name'.*pip install datasets"):
         read_rows("owner/name")
 
 
@@ -138,7 +140,7 @@ def test_a_dataset_is_read_by_its_id(monkeypatch):
         ("x.csv", "a,b\n1\n", "line 2 has more or fewer fields"),
         ("x.csv", "a,b\n1,2,3\n", "line 2 has more or fewer fields"),
         ("x.txt", "\n \n", "holds no rows"),
-        ("x.parquet", "PAR1", r"ends with '\.parquet'; expected one of \.jsonl"),
+        ("x.xlsx", "PK", r"ends with '\.xlsx'; expected one of \.jsonl"),
     ],
 )
 def test_a_bad_file_is_named_with_its_place(tmp_path, name, content, message):

@@ -547,10 +547,10 @@ def test_a_file_does_not_take_the_place_of_a_module(folder):
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("lenght", "neither 'length' nor FILE.py:function"),
-        ("judge.py", "neither"),
-        ("judge.txt:reward", "neither"),
-        ("judge.py:", "neither"),
+        ("lenght", r"no reward 'lenght'\. Looked for: 'length', FILE\.py:function.*Did you mean 'length'\?"),
+        ("judge.py", r"no reward 'judge\.py'\. Looked for"),
+        ("judge.txt:reward", "no reward"),
+        ("judge.py:", "no reward"),
         ("missing.py:reward", "no file missing.py"),
         ("judge.py:rewards", r"no function 'rewards'; it has helper, reward\."),
         ("judge.py:NUMBER", "no function 'NUMBER'"),

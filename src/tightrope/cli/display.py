@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TextIO, TypeGuard
 
-from tightrope.runs.records import printable
+from tightrope.runs.records import in_lines, printable
 from tightrope.training.events import Evaluated, Event, Finished, Message, Samples, Started, Updated
 
 if TYPE_CHECKING:
@@ -22,7 +22,8 @@ BARS = "▁▂▃▄▅▆▇█"
 PLAIN_LINES = 20  # of a run that is not watched on a terminal
 SECONDS_BETWEEN_PAINTS = 0.25
 SAMPLES = 3  # responses of a table: the best score, the middle and the worst
-CELLS = 4  # figures in one line of the panel
+WIDEST = 76  # characters of a line of the panel; fewer in a narrow terminal
+BORDER = 4  # of the panel, left and right
 
 
 def number(value: float | None) -> str:
@@ -114,16 +115,19 @@ class Display:
     """The display of a run, a listener and a context around the run. ``run`` is its folder, ``step`` its
     position.
 
-    ``live``: a small panel, repainted in place at most four times a second and only when something happened.
-    Otherwise about twenty aligned lines a run; ``quiet``: only warnings, on stderr.
+    ``live``: a small panel, repainted in place at most four times a second and only when something happened;
+    until the run begins it shows ``title`` and that models and data are loaded. Otherwise about twenty
+    aligned lines a run; ``quiet``: only warnings, on stderr.
     """
 
-    def __init__(self, view: View, stream: TextIO, *, quiet: bool = False, live: bool = False) -> None:
+    def __init__(
+        self, view: View, stream: TextIO, *, quiet: bool = False, live: bool = False, title: str = ""
+    ) -> None:
         self.run: str | None = None
         self.step = self.total = 0
         self._view, self._stream, self._quiet = view, stream, quiet
         self._panel: Live | None = self._live() if live and not quiet else None
-        self._title = ""
+        self._title = title
         self._seen: dict[str, float] = {}  # the newest finite value of each metric
         self._curve: list[float] = []
         self._first, self._begin = 0, time.monotonic()
@@ -139,6 +143,7 @@ class Display:
     def __enter__(self) -> Display:
         if self._panel is not None:
             self._panel.start()
+            self._panel.update(self._paint(), refresh=True)  # before torch is imported, which takes seconds
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -216,27 +221,26 @@ class Display:
     def _paint(self) -> Panel:
         from rich import box
         from rich.panel import Panel
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
         from rich.text import Text
 
-        bar, learned, body = Table.grid(padding=(0, 2)), Table.grid(padding=(0, 2)), Table.grid()
-        bar.add_row(
-            ProgressBar(total=max(1, self.total), completed=self.step, width=34),
-            Text(f"{self.step:,} of {self.total:,} {self._view.counted}"),
-            Text(f"{self._share():.0f} %"),
-            Text(f"left {clock(self.seconds_left())}", style="bold"),
-        )
-        first, *others = self._view.columns
-        value = Text(self._cell(first), style="bold green")
-        learned.add_row(first.head, value, Text(sparkline(self._curve, 30), style="green"))
-        body.add_row(bar)
-        body.add_row(learned)
-        cells = [(column.head, self._cell(column)) for column in others]
-        figures = [f"{cell} {head}" if "/" in head else f"{head} {cell}" for head, cell in cells]
-        for begin in range(0, len(figures), CELLS):
-            body.add_row(Text("   ".join(figures[begin : begin + CELLS])))
-        return Panel(body, title=Text(self._title), title_align="left", box=box.ROUNDED, expand=False)
+        assert self._panel is not None
+        width = max(8, min(WIDEST, self._panel.console.width - BORDER))
+        body = Text("loading ..." if self.run is None else "", style="" if self.run else "dim")
+        if self.run is not None:
+            full = round(width * self.step / max(1, self.total))
+            body.append("━" * full, style="green")
+            body.append("━" * (width - full), style="dim")
+            reached = [f"{self.step:,} of {self.total:,} {self._view.counted}", f"{self._share():.0f} %"]
+            body.append("\n" + in_lines([*reached, f"left {clock(self.seconds_left())}"], width))
+            first, *others = self._view.columns
+            body.append(f"\n{first.head} ").append(self._cell(first), style="bold green")
+            room = width - len(first.head) - len(self._cell(first)) - 4
+            body.append("   " + sparkline(self._curve, max(1, room)), style="green")
+            cells = [(column.head, self._cell(column)) for column in others]
+            figures = [f"{cell} {head}" if "/" in head else f"{head} {cell}" for head, cell in cells]
+            body.append("\n" + in_lines(figures, width))
+        title = Text(self._title, overflow="ellipsis", no_wrap=True)
+        return Panel(body, title=title, title_align="left", box=box.ROUNDED, expand=False)
 
     def _cell(self, column: Column) -> str:
         found = all(name in self._seen for name in column.metrics)

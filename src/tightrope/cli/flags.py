@@ -140,9 +140,10 @@ def add_fields(
                 flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text
             )
         elif plain is tuple:
-            whole = kinds(kind)[name].items is int
-            metavar, read = ("N", width) if whole else ("KEY", str)
-            group.add_argument(flag, nargs="*", type=read, metavar=metavar, help=text)
+            if kinds(kind)[name].items is int:
+                group.add_argument(flag, nargs="*", type=width, metavar="N", help=text)
+            else:  # words may also be given one by one, each with its flag
+                group.add_argument(flag, nargs="*", action="extend", metavar="WORD", help=text)
         elif plain is dict:
             group.add_argument(flag, nargs="*", type=pair, action=Pairs, metavar="NAME=VALUE", help=text)
         else:
@@ -159,7 +160,7 @@ def help_text(field: dataclasses.Field[Any], optional: bool, written: str = "{}"
     elif isinstance(default, bool):
         shown = "on" if default else "off"
     elif isinstance(default, tuple):
-        shown = " ".join(str(item) for item in default) or "none"
+        shown = " ".join(map(str, default)) or "none"
     else:
         shown = f"{default:g}" if isinstance(default, float) else str(default)
     limits = range_text(field.metadata)

@@ -17,13 +17,18 @@ from tightrope.cli.options import (
     Options,
     doctor_parser,
     evaluate_parser,
-    import_env_module,
     print_json,
     record_parser,
     sample_parser,
     stdout_for_json,
 )
-from tightrope.cli.train_commands import look_again, require_transformers, resume, train
+from tightrope.cli.train_commands import (
+    import_env_module,
+    look_again,
+    require_transformers,
+    resume,
+    train,
+)
 from tightrope.errors import TightropeError
 from tightrope.runs import signals
 from tightrope.runs.durable import CannotWrite
@@ -80,13 +85,16 @@ def _sample(words: list[str]) -> int:
     require_transformers()
     from tightrope.language.compare import sample_run
 
-    rows = sample_run(given["run"], **{k: given[k] for k in ("prompt", "count", "seed") if k in given})
+    names = ("prompt", "count", "seed", "reward")
+    rows = sample_run(given["run"], figures=True, **{k: given[k] for k in names if k in given})
     if given.get("json"):
         print_json({"samples": rows})
     else:
         from tightrope.language.alignment.samples import print_comparison
 
         print_comparison(rows)
+        if "score_after" not in rows[0]:
+            print("no score: the reward was code, which no file may name; add --reward FILE.py:function")
     return 0
 
 
@@ -94,7 +102,7 @@ def _recorded(given: Options) -> int:
     """The newest rollout in samples.jsonl, from the best score to the worst."""
     from tightrope.language.alignment.samples import print_samples, read_samples, spread
 
-    for option in ("prompt", "seed"):
+    for option in ("prompt", "seed", "reward"):
         if option in given:
             raise UsageError(f"--recorded samples nothing, so that --{option} has no meaning. Leave one out.")
     rows = read_samples(given["run"])

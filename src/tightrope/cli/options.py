@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
-import importlib.util
 import json
 import os
+import re
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -28,7 +27,14 @@ from tightrope.cli.flags import (
 )
 from tightrope.control.presets import decided
 from tightrope.control.settings import ALGORITHM_SETTINGS, TrainSettings
-from tightrope.language.settings import RECIPES, AlignSettings, ModelSettings, RewardSettings, SFTSettings
+from tightrope.language.settings import (
+    RECIPES,
+    AlignSettings,
+    ModelSettings,
+    RewardSettings,
+    SFTSettings,
+    may_stand_in_a_file,
+)
 from tightrope.runs.folders import command_of
 from tightrope.runs.records import retyped
 from tightrope.settings.values import ORIGINS, Settings, rule_of
@@ -302,7 +308,11 @@ def resume_parser() -> Parser:
         help="A new end (align: responses); also continues a finished run (default: the run's own).",
     )
     group.add_argument(
-        "--reward", metavar="R", help="align: the reward again, if it was your own code (default: the run's)."
+        "--reward",
+        action="extend",
+        nargs="*",
+        metavar="R",
+        help="align: the reward again, all of it, if your own code was in it (default: the run's).",
     )
     group.add_argument(
         "--gold",
@@ -320,7 +330,7 @@ def resume_parser() -> Parser:
 
 def sample_parser() -> Parser:
     """The options of ``sample``."""
-    text = "Responses of the aligned model beside the reference's."
+    text = "Responses of the aligned model beside the reference's, with score, KL and length."
     parser = _run_parser("sample", text, "Run folder of align.")
     group = parser.add_argument_group("sampling")
     group.add_argument(
@@ -330,6 +340,13 @@ def sample_parser() -> Parser:
         "--count", type=_at_least_one, metavar="N", help="How many prompts of the run's data (default 8)."
     )
     group.add_argument("--seed", type=int, metavar="N", help="Seed of sampling (default: the run's + 1).")
+    group.add_argument(
+        "--reward",
+        action="extend",
+        nargs="*",
+        metavar="R",
+        help="Score with this; as in align (default: the run's, unless that was your own code).",
+    )
     group.add_argument(
         "--recorded",
         action="store_true",
@@ -396,12 +413,18 @@ def training_options(command: str, words: list[str]) -> tuple[Options, Options, 
         for name, value in given.items()
         if name not in NOT_SETTINGS
     }
+    if "stop" in flags:  # a shell gives the two characters \\n for a line end
+        flags["stop"] = tuple(re.sub(r"\\([ntr\\])", _escaped, word) for word in flags["stop"])
     for name, value in of_file.items():
         if name not in flags:
             _refuse_code(command, str(path), name, value)
     origins = {"settings file": of_file, "recipe": recipe, "flag": flags}
     origin_of = {name: origin for origin, values in origins.items() for name in values}
     return given, {**of_file, **recipe, **flags}, origin_of
+
+
+def _escaped(found: re.Match[str]) -> str:
+    return {"n": "\n", "t": "\t", "r": "\r"}.get(found[1], found[1])
 
 
 def _value_of(flag: str, words: list[str]) -> str | None:
@@ -457,44 +480,14 @@ def _values_of_file(command: str, path: str) -> Options:
 
 def _refuse_code(command: str, path: str, name: str, value: Any) -> None:
     """UsageError for a value that only the user may give: a Python object or code."""
-    known = (None, "", *AlignSettings.BUILT_IN_REWARDS)
-    judge = name in ("reward", "gold") and value not in known and not Path(value).is_dir()
+    words = value if isinstance(value, tuple) else (value,)
+    judge = name in ("reward", "gold") and not all(may_stand_in_a_file(word) for word in words if word)
     module = name == "env" and ":" in value
     if judge or module or (isinstance(value, str) and value.startswith("<")):
         word = "FILE.py:function" if name in ("reward", "gold") else "ID" if name == "env" else "FILE"
         flag = "" if name == "env" else f"--{name.replace('_', '-')} "
         raise UsageError(
-            f"--settings {path}: {name} was {value!r}, which no file may name: an object, code, or a "
-            f"folder that is gone. Give it again: {PROGRAM} {command} --settings {shlex.quote(path)} "
-            f"{flag}{retyped(value, word)}"
+            f"--settings {path}: {name} was {' '.join(map(repr, words))}, which no file may name: an object, "
+            f"code, or a folder that is gone. Give it again: {PROGRAM} {command} --settings "
+            f"{shlex.quote(path)} {flag}{' '.join(retyped(one, word) for one in words)}"
         )
-
-
-def import_env_module(given: Options) -> None:
-    """Import the module of --env-module, a name or a file of the user, so that it registers environments."""
-    name = given.get("env_module")
-    if name is None:
-        return
-    if not name:
-        raise UsageError("--env-module is empty. Give a module or FILE.py.")
-
-    path = Path(name)
-    if path.suffix != ".py":
-        sys.path.insert(0, os.getcwd())
-        try:
-            importlib.import_module(name)
-        except ModuleNotFoundError as error:
-            if error.name is None or not (name + ".").startswith(error.name + "."):
-                raise
-            raise UsageError(
-                f"--env-module {name}: there is no such module. Give a module or FILE.py."
-            ) from error
-        return
-    if not path.is_file():
-        raise UsageError(f"--env-module {name}: there is no such file.")
-    sys.path.insert(0, str(path.resolve().parent))
-    spec = importlib.util.spec_from_file_location(path.stem, path.resolve())
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)

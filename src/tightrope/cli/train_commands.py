@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import importlib.util
 import os
 import shlex
@@ -20,7 +21,6 @@ from tightrope.cli.options import (
     SETTINGS_CLASSES,
     Options,
     dry_run,
-    import_env_module,
     print_json,
     resume_parser,
     training_options,
@@ -28,6 +28,7 @@ from tightrope.cli.options import (
 from tightrope.runs import checkpoint, signals
 from tightrope.runs.durable import CannotWrite
 from tightrope.runs.folders import command_of
+from tightrope.runs.records import printable, retyped
 from tightrope.runs.run import Run
 from tightrope.settings.values import Settings
 
@@ -37,6 +38,16 @@ REQUIRED = {
     "sft": {"data": "--data FILE.jsonl"},
     "reward": {"data": "--data FILE.jsonl"},
     "align": {"data": "--data PROMPTS.jsonl", "reward": "--reward length"},
+}
+# what is typed after a command; RUN and MODEL are replaced
+FOLLOWS = {
+    "train": ("evaluate RUN", "record RUN"),
+    "sft": (
+        "reward --model RUN --data PAIRS.jsonl",
+        "align --model RUN --data PROMPTS.jsonl --reward length",
+    ),
+    "reward": ("align --model MODEL --data PROMPTS.jsonl --reward RUN",),
+    "align": ("sample RUN",),
 }
 START, RESUME = 0, 1  # places in `_functions`
 Training = Callable[..., Any]
@@ -98,6 +109,36 @@ def resume(words: list[str]) -> int:
     return _watched(command, given, RESUME, given["run"], **values)
 
 
+def import_env_module(given: Options) -> None:
+    """Import the module of --env-module, a name or a file of the user, so that it registers environments."""
+    name = given.get("env_module")
+    if name is None:
+        return
+    if not name:
+        raise UsageError("--env-module is empty. Give a module or FILE.py.")
+
+    path = Path(name)
+    if path.suffix != ".py":
+        sys.path.insert(0, os.getcwd())
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not (name + ".").startswith(error.name + "."):
+                raise
+            raise UsageError(
+                f"--env-module {name}: there is no such module. Give a module or FILE.py."
+            ) from error
+        return
+    if not path.is_file():
+        raise UsageError(f"--env-module {name}: there is no such file.")
+    sys.path.insert(0, str(path.resolve().parent))
+    spec = importlib.util.spec_from_file_location(path.stem, path.resolve())
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+
+
 def look_again(given: Options, settings: dict[str, Any] | None = None) -> None:
     """`look_first` for the task of a run, or the one of --env in its place."""
     from tightrope.control.environments.make import look_first
@@ -148,13 +189,15 @@ def _watched(command: str, given: Options, which: int, *args: Any, **values: obj
     stream = sys.stderr if as_json else sys.stdout
     live = not as_json and display.can_live(sys.stdout, dict(os.environ))
     view = VIEWS[command]
-    shown = Display(view, stream, quiet=quiet, live=live)
+    name = getattr(args[0], "env", "") or getattr(args[0], "model", args[0])
+    title = printable(f"{PROGRAM} {command if which == START else 'resume'} · {name}")
+    shown = Display(view, stream, quiet=quiet, live=live, title=title)
     try:
         with shown:
             ended = _functions(command)[which](*args, **values, listeners=[shown])
     except KeyboardInterrupt as error:
         run = args[0] if which == RESUME else shown.run
-        again = _command("resume", run, given) if run else ""
+        again = _command("resume RUN", run, given) if run else ""
         code, reached = (error.code, error.position) if isinstance(error, signals.Stopped) else (130, 0)
         # the display may be behind
         print(farewell(error, run, max(shown.step, reached), view.counted, again), file=sys.stderr)
@@ -162,7 +205,8 @@ def _watched(command: str, given: Options, which: int, *args: Any, **values: obj
     except CannotWrite as error:
         if shown.run and error.command:
             with contextlib.suppress(ValueError, OSError):  # the folder may be gone
-                error.command = _command("resume", shown.run, given)  # with the user's own code that it needs
+                # with the user's own code that it needs
+                error.command = _command("resume RUN", shown.run, given)
         raise
     summary = ended if isinstance(ended, dict) else ended.summary
     if as_json:
@@ -195,18 +239,22 @@ def farewell(error: BaseException, run: str | None, step: int, counted: str, com
     return f"Stopped{by} at {at}. {text} Go on with:\n  {command}"
 
 
-def _command(name: str, run: str, given: Options) -> str:
-    """A command to type about a run, with the code of the user that it needs."""
-    words = [PROGRAM, name, run]
+def _command(typed: str, run: str, given: Options, model: str = "") -> str:
+    """A command to type about a run, with the code of the user that it needs. ``typed``: with the words RUN
+    and MODEL in place of these.
+    """
+    known = {"RUN": run, "MODEL": model}
+    words = [PROGRAM, *(known.get(word, word) for word in typed.split())]
     if "env_module" in given:
         words += ["--env-module", given["env_module"]]
     if ":" in given.get("env", ""):
         words += ["--env", given["env"]]
-    if name == "resume":
+    if typed == "resume RUN":
         settings = Run.open(run).settings
         for judge in ("reward", "gold"):
-            if ".py:" in str(settings.get(judge)):
-                words += [f"--{judge}", settings[judge]]
+            named = settings.get(judge) or ()
+            if ".py:" in str(named):
+                words += [f"--{judge}", *([named] if isinstance(named, str) else named)]
     return shlex.join(words)
 
 
@@ -222,11 +270,11 @@ def _print_end(command: str, summary: dict[str, Any], run: str, given: Options, 
     print(f"run          {run}", file=stream)
     if quiet:
         return
-    follows = {"train": ("evaluate", "record"), "align": ("sample",)}.get(command, ())
-    for title, name in zip(("next", ""), follows, strict=False):
-        print(f"{title:<12} {_command(name, run, given)}", file=stream)
     if command != "train":
         print(f"model        {Path(run) / 'model'}", file=stream)
+    model = retyped(summary.get("model"), "MODEL")
+    for title, follows in zip(("next", ""), FOLLOWS[command], strict=False):
+        print(f"{title:<12} {_command(follows, run, given, model)}", file=stream)
 
 
 def _print_returns(summary: dict[str, Any], final: dict[str, Any], run: str | None, stream: TextIO) -> None:

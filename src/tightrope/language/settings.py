@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
@@ -63,7 +64,11 @@ class ModelSettings(Settings):
 class SupervisedSettings(ModelSettings):
     """What supervised fine-tuning and reward modelling share."""
 
-    data: str = setting("", "The training examples: a .jsonl, .json, .csv or .txt file, or a dataset's id.")
+    data: str = setting(
+        "",
+        "The training examples: a .jsonl, .json, .csv, .txt or .parquet file, a folder of save_to_disk, or a "
+        "dataset's id.",
+    )
     validation: str | None = setting(None, "Held-out examples; none: a share of the data is held out.")
     held_out: float = setting(0.05, "Share of the data that is held out.", at_least=0, at_most=0.5)
     max_examples: int | None = setting(None, "Use this many examples at most; none: all.", at_least=1)
@@ -123,8 +128,16 @@ class AlignSettings(ModelSettings):
 
     BUILT_IN_REWARDS: ClassVar = ("length",)  # words for reward and gold that name no file
 
-    data: str = setting("", "The prompts: a .jsonl, .json, .csv or .txt file, or a dataset's id.")
-    reward: str = setting("", "length, FILE.py:function, or the folder of a reward model.")
+    data: str = setting(
+        "",
+        "The prompts: a .jsonl, .json, .csv, .txt or .parquet file, a folder of save_to_disk, or a dataset's "
+        "id.",
+    )
+    reward: tuple[str, ...] = setting(
+        (),
+        "length, FILE.py:function, or the folder or hub id of a reward model; with =X, that times X. Several "
+        "are added up.",
+    )
     gold: str | None = setting(
         None, "A second judge of the same kinds, asked on held-out prompts; never trained on. none: no judge."
     )
@@ -170,9 +183,12 @@ class AlignSettings(ModelSettings):
     reward_clip: float | None = setting(None, "Scores are kept within +- this; none: off.", above=0)
     whiten_rewards: bool = setting(False, "Divide rewards by their deviation; the mean stays.")
     missing_eos_penalty: float | None = setting(
-        None, "Subtracted from the score of a response without EOS; none: off.", at_least=0
+        None, "Subtracted from the score of a response cut at max_new_tokens; none: off.", at_least=0
     )
-    ignore_eos: bool = setting(False, "Sample max_new_tokens always; EOS is never chosen.")
+    ignore_eos: bool = setting(False, "EOS is never chosen: a response has max_new_tokens, or a stop text.")
+    stop: tuple[str, ...] = setting(
+        (), "Texts that end a response as EOS does; trained on, but cut from the text that is scored."
+    )
     truncation: str = setting(
         "terminal",
         "A response cut at max_new_tokens ends there, or goes on in the critic's eyes.",
@@ -239,8 +255,17 @@ class AlignSettings(ModelSettings):
             raise ValueError(
                 "critic adapter needs the frozen trunk of --tune lora. With --tune full use head or separate."
             )
+        if "" in self.stop:
+            raise ValueError("stop holds an empty text, which every response ends with. Take it out.")
         if self.ptx_weight and self.ptx_data is None:
             raise ValueError("ptx_weight needs texts: give ptx_data, or ptx_weight 0.")
+
+    def to_json(self) -> dict[str, Any]:
+        """As of any settings; one reward is a word, as in runs of before there could be several."""
+        found = super().to_json()
+        if len(self.reward) < 2:
+            found["reward"] = "".join(self.reward)
+        return found
 
     @property
     def exact_in_loss(self) -> bool:
@@ -281,14 +306,38 @@ def recorded(settings: AnySettings, **given: object) -> AnySettings:
     object only its name is, in angle brackets, so that nobody takes it for a file, a folder or a reward.
     None keeps the setting.
     """
-    names: dict[str, Any] = {
-        name: str(value)
-        if isinstance(value, str | Path)
-        else f"<{getattr(value, '__name__', type(value).__name__).strip('<>')}>"
-        for name, value in given.items()
-        if value is not None
-    }
+    names: dict[str, Any] = {name: _word(value) for name, value in given.items() if value is not None}
+    reward = given.get("reward")
+    if isinstance(reward, list | tuple):
+        every = reward if isinstance(reward, list) else [reward]
+        names["reward"] = [
+            f"{_word(one[0])}={one[1]}" if isinstance(one, tuple) and len(one) == 2 else _word(one)
+            for one in every
+        ]
     return settings.with_values(**names)
+
+
+def _word(value: object) -> str:
+    if isinstance(value, str | Path):
+        return str(value)
+    return f"<{getattr(value, '__name__', type(value).__name__).strip('<>')}>"
+
+
+def weighted(word: str) -> tuple[str, float]:
+    """A reward as it is typed, without its weight, and the weight: ``length=0.1``. What does not end with =
+    and a number, and what is the name of a file or folder as it stands, has the weight 1.
+    """
+    name, _, number = word.rpartition("=")
+    if name and not Path(word).exists():
+        with contextlib.suppress(ValueError):
+            return name, float(number)
+    return word, 1.0
+
+
+def may_stand_in_a_file(word: str) -> bool:
+    """Whether a file may name this reward: a built-in one, or a folder, but never code."""
+    name = weighted(word)[0]
+    return name in AlignSettings.BUILT_IN_REWARDS or Path(name).is_dir()
 
 
 class Recipe(NamedTuple):

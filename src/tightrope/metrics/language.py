@@ -40,7 +40,8 @@ LANGUAGE_TABLE = (
         "objective/kl_token_mean",
         "nats/token",
         "any",
-        "k1 to the reference, mean over response tokens; objective/kl divided by about the length.",
+        "k1 to the reference, mean over all response tokens of the rollout: objective/kl divided by "
+        "objective/response_length.",
         negative=True,
     ),
     metric("objective/kl_beta", "1", "any", "Weight of the KL to the reference in this update."),
@@ -69,7 +70,9 @@ LANGUAGE_TABLE = (
         "objective/non_score_reward",
         "score",
         "any",
-        "The part of objective/rlhf_reward that the KL penalty adds: minus kl_beta times KL.",
+        "The part of objective/rlhf_reward that the KL penalty adds, over the responses that count: minus "
+        "kl_beta times k1, with exact-split times the exact KL of the states after the first; 0 where the KL "
+        "is in the loss alone.",
         negative=True,
     ),
     metric(
@@ -89,14 +92,26 @@ LANGUAGE_TABLE = (
         "objective/entropy_token_mean",
         "nats/token",
         "any",
-        "-logp of the sampled tokens, mean over response tokens.",
+        "-logp of the sampled tokens, mean over all response tokens of the rollout: objective/entropy "
+        "divided by objective/response_length, so that long responses weigh more.",
     ),
-    metric("objective/response_length", "tokens", "any", "Mean tokens of a response, its EOS included."),
+    metric(
+        "objective/response_length",
+        "tokens",
+        "any",
+        "Mean tokens of a response, its EOS or stop string included.",
+    ),
     metric(
         "objective/eos_fraction",
         "fraction",
         "any",
         "Share of responses that ended with an end-of-sequence token.",
+    ),
+    metric(
+        "objective/stop_fraction",
+        "fraction",
+        "any",
+        "With stop: share of responses that ended with a stop string.",
     ),
     metric(
         "objective/truncated_fraction",
@@ -159,11 +174,19 @@ LANGUAGE_TABLE = (
     metric("sft/held_out_loss", "nats/token", "down", "The same on examples that are not trained on."),
     metric("sft/learning_rate", "1", "any", "Adam's step size in this update.", high=1e-2),
     metric("sft/grad_norm", "1", "any", "Norm of all gradients together, before it is limited."),
-    metric("sft/tokens", "tokens", "any", "Tokens learnt from so far."),
+    metric("sft/tokens", "tokens", "any", "Tokens learnt from so far; those of every epoch count."),
     metric(
-        "reward/loss", "nats", "down", "-log sigmoid(chosen - rejected), mean over pairs; ln 2 is chance."
+        "reward/loss",
+        "nats",
+        "down",
+        "-log sigmoid(chosen - rejected), mean over the minibatch; ln 2 is chance.",
     ),
-    metric("reward/accuracy", "fraction", "up", "Share of training pairs whose chosen one scores higher."),
+    metric(
+        "reward/accuracy",
+        "fraction",
+        "up",
+        "Share of the minibatch's pairs whose chosen one scores higher; equal scores count half.",
+    ),
     metric("reward/held_out_accuracy", "fraction", "up", "The same on pairs not trained on; 0.5 is chance."),
     metric(
         "reward/calibration_error",
@@ -177,7 +200,7 @@ LANGUAGE_TABLE = (
         "reward/margin",
         "score",
         "any",
-        "Mean of chosen - rejected over pairs.",
+        "Mean of chosen - rejected over the minibatch, before scores are put to deviation 1.",
         negative=True,
     ),
     metric(

@@ -11,6 +11,7 @@ import math
 import os
 import re
 import stat
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -138,8 +139,14 @@ def retyped(name: Any, placeholder: str) -> str:
     FILE.py:function. Otherwise the placeholder is returned, so that no file can write commands for a user to
     copy.
     """
-    plain = isinstance(name, str) and re.fullmatch(r"[\w.~/][\w.~/:-]*", name)
+    plain = isinstance(name, str) and re.fullmatch(r"[\w.~/][\w.~/:=-]*", name)
     return name if plain and (":" in name or ":" not in placeholder) else placeholder
+
+
+def in_lines(cells: Sequence[str], width: int) -> str:
+    """Short texts side by side, as many in a line as fit into ``width`` characters; none is broken."""
+    whole = "   ".join(cell.replace(" ", "\xa0") for cell in cells)  # where textwrap breaks no line
+    return textwrap.fill(whole, max(1, width), break_on_hyphens=False).replace("\xa0", " ")
 
 
 def printable(text: str) -> str:

@@ -104,10 +104,13 @@ def _kind(hint: object) -> Kind:
 def typed(name: str, value: object, kind: Kind) -> Any:
     """``value`` as its field holds it: a list as a tuple, a whole number as a float if one is expected.
 
-    Raises ValueError for a value of another kind. The settings of an update rule are returned as they are.
+    One word where several may stand is a tuple of it. Raises ValueError for a value of another kind. The
+    settings of an update rule are returned as they are.
     """
     if value is None and kind.optional:
         return None
+    if kind.type is tuple and kind.items is str and isinstance(value, str):
+        return (value,) if value else ()
     if kind.type is tuple and isinstance(value, list | tuple) and all(type(x) is kind.items for x in value):
         return tuple(typed(name, x, Kind(kind.items, False)) for x in value)
     if kind.type is dict and isinstance(value, dict) and not _plain(value):

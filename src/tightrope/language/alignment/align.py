@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from tightrope.language.alignment.iteration import Trainer
-from tightrope.language.data.examples import Rows
+from tightrope.language.data.examples import FILES, Rows
 from tightrope.language.model.load import quiet_libraries
 from tightrope.language.reward.judge import RewardSources
-from tightrope.language.settings import AlignSettings, recorded
+from tightrope.language.settings import AlignSettings, may_stand_in_a_file, recorded
 from tightrope.language.supervised.prepare import threads
 from tightrope.runs import signals
 from tightrope.runs.folders import require_kind
@@ -60,9 +60,9 @@ def align(
 
     ``prompts``: texts, message lists or rows with a "prompt", or a file of them. ``reward``: a function as
     TRL calls it, (function, weight), "length", FILE.py:function, the folder of a reward model, or a list of
-    these. ``gold``: another judge of the same kinds, asked on held-out prompts and never trained on.
-    Everything else is a field of AlignSettings or RLHFSettings. Raises ValueError for what cannot work,
-    before anything is trained.
+    these, whose scores are added up. ``gold``: another judge of the same kinds, asked on held-out prompts and
+    never trained on. Everything else is a field of AlignSettings or RLHFSettings. Raises ValueError for what
+    cannot work, before anything is trained.
     """
     settings = (settings or AlignSettings()).with_values(**values)
     settings = recorded(settings, data=prompts, reward=reward, gold=gold)
@@ -88,7 +88,7 @@ def _trainer(
     return Trainer(
         settings,
         settings.data if prompts is None else prompts,
-        settings.reward if reward is None else reward,
+        list(settings.reward) if reward is None else reward,
         settings.gold if gold is None else gold,
         events,
     )
@@ -137,14 +137,17 @@ def _require_what_no_file_gives(
 ) -> None:
     """ValueError for prompts and judges that were objects and are not given again."""
     for name, value in (("reward", reward), ("gold", gold)):
-        known = getattr(settings, name)
-        if value is None and known not in (None, *settings.BUILT_IN_REWARDS) and not Path(known).is_dir():
+        known = getattr(settings, name) or ()
+        words = (known,) if isinstance(known, str) else known
+        if value is None and not all(map(may_stand_in_a_file, words)):
+            again = " ".join(retyped(word, "FILE.py:function") for word in words)
             raise ValueError(
-                f"The {name} of {run_dir} was {known!r}: code, which no file may import, or a folder that is "
-                "not there any more. If it is yours, or you have read it, name it again: tightrope resume "
-                f"{shlex.quote(str(run_dir))} --{name} {retyped(known, 'FILE.py:function')}"
+                f"The {name} of {run_dir} was {' '.join(map(repr, words))}: code, which no file may import, "
+                "or a folder that is not there any more. If it is yours, or you have read it, name it again: "
+                f"tightrope resume {shlex.quote(str(run_dir))} --{name} {again}"
             )
-    if prompts is None and not Path(settings.data).is_file():
+    moved = Path(settings.data).suffix.lower() in FILES and not Path(settings.data).is_file()
+    if prompts is None and (moved or settings.data.startswith("<")):
         raise ValueError(
             f"The prompts of {run_dir} were {settings.data!r}, which is not a file. Give them again: "
             f"tightrope resume {shlex.quote(str(run_dir))} --data PROMPTS.jsonl"

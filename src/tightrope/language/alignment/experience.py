@@ -6,9 +6,9 @@ import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from tightrope.algorithms.descent import OutOfMemory, free, is_out_of_memory
 from tightrope.language.alignment.kl import kl_rewards
 from tightrope.language.data.batching import length_groups, pad_left
 from tightrope.language.data.examples import Prompt
-from tightrope.language.generation.sample import Completions, sample
+from tightrope.language.generation.sample import Completions, meets_stop, sample
 from tightrope.language.policy.policy_model import Experience, FirstPass, ResponseInputs
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.functions import Scores
@@ -27,6 +27,9 @@ from tightrope.language.settings import AlignSettings
 from tightrope.maths import returns
 from tightrope.maths.statistics import masked_variance
 from tightrope.maths.values import ReturnScale
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerBase
 
 
 class PromptOrder:
@@ -61,8 +64,16 @@ def _advice_on_memory(roles: Roles) -> Iterator[None]:
         ) from error
 
 
-def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, samples: int) -> Completions:
-    """``samples`` responses of the policy to each prompt; rows of one prompt are neighbours.
+def stops_of(
+    tokenizer: PreTrainedTokenizerBase, settings: AlignSettings
+) -> Callable[[list[list[int]]], list[bool]] | None:
+    """What ends a response beside an EOS, as `sample` takes it; None where nothing does."""
+    return functools.partial(meets_stop, tokenizer=tokenizer, stop=settings.stop) if settings.stop else None
+
+
+def respond(roles: Roles, prompts: Sequence[Prompt], seeds: Sequence[int], samples: int) -> Completions:
+    """``samples`` responses of the policy to each prompt; rows of one prompt are neighbours. ``seeds`` decide
+    every token.
 
     Raises OutOfMemory, with advice.
     """
@@ -70,12 +81,13 @@ def respond(roles: Roles, prompts: Sequence[Prompt], seed: int, iteration: int, 
     device = next(roles.model.parameters()).device
     tokens, real = (x.to(device) for x in pad_left([prompt.tokens for prompt in prompts]))
     shape = len(prompts) * samples, settings.max_new_tokens
-    uniforms = torch.from_numpy(np.random.default_rng([seed, 8, iteration]).random(shape)).to(device)
+    uniforms = torch.from_numpy(np.random.default_rng(seeds).random(shape)).to(device)
     with _advice_on_memory(roles):
         with roles.frozen_policy():
             responses = sample(
-                roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples
-            )
+                roles.model, tokens, real, roles.sampling, uniforms, roles.eos, samples_per_prompt=samples,
+                stops_at=stops_of(roles.tokenizer, settings),
+            )  # fmt: skip
         return Completions(
             tokens=torch.cat([tokens.repeat_interleave(samples, 0), responses.tokens], 1),
             real=torch.cat([real.repeat_interleave(samples, 0), responses.mask], 1),
@@ -94,7 +106,7 @@ def gather(
     responses are of about one length, need no groups, and memory is enough. Raises OutOfMemory, with advice,
     when memory runs out without ``keep`` as well.
     """
-    answers = respond(roles, prompts, seed, iteration, samples)
+    answers = respond(roles, prompts, [seed, 8, iteration], samples)
     short = False
     if keep and len(length_groups(answers.real, answers.responses.mask)) == 1:
         try:

@@ -29,6 +29,7 @@ def rollout_metrics(
     score where none counts.
     """
     mask, ended = experience.responses.mask, experience.responses.ended
+    stopped = experience.responses.stopped
     log_ratio = torch.where(mask, experience.ref_logp - experience.logp, 0.0)
     total = scores.total[scores.valid]
     nan = float("nan")
@@ -60,7 +61,8 @@ def rollout_metrics(
         "objective/scores": float(np.mean(total)) if len(total) else nan,
         "objective/scores_std": float(np.std(total)) if len(total) else nan,
         "objective/response_length": float(mask.sum()) / len(mask),
-        "objective/eos_fraction": float(ended.float().mean()),
+        "objective/eos_fraction": float((ended if stopped is None else ended & ~stopped).float().mean()),
+        **({} if stopped is None else {"objective/stop_fraction": float(stopped.float().mean())}),
         "objective/truncated_fraction": float((~ended).float().mean()),
         "objective/masked_samples": float((~valid).sum()),
         "objective/distinct_2": distinct_ngrams(experience.ids),

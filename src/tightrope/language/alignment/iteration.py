@@ -91,10 +91,12 @@ class Taken(NamedTuple):
         """Whether there is a response to learn from."""
         return bool(self.scores.valid.any())
 
-    def rows(self, tokenizer: PreTrainedTokenizerBase, episodes: int) -> list[dict[str, Any]]:
+    def rows(
+        self, tokenizer: PreTrainedTokenizerBase, episodes: int, stop: Sequence[str]
+    ) -> list[dict[str, Any]]:
         """The responses as samples.jsonl holds them."""
         return sample_rows(
-            tokenizer, self.asked, self.experience, self.scores, self.batch, self.valid, episodes
+            tokenizer, self.asked, self.experience, self.scores, self.batch, self.valid, episodes, stop
         )
 
 
@@ -365,7 +367,7 @@ class Trainer:
         self.iteration += 1
         seconds = metrics["time/update_seconds"] + taken.seconds
         metrics["time/fps"] = float(experience.responses.mask.sum()) / seconds
-        rows = taken.rows(self.roles.tokenizer, self.episodes)
+        rows = taken.rows(self.roles.tokenizer, self.episodes, settings.stop)
         on_grid = self._reached(settings.checkpoint_every)
         return Update(self.episodes, self.total, metrics, before, on_grid, samples=rows, pause=taken.pause)
 
@@ -486,7 +488,7 @@ class Trainer:
         size, seed, found = self.settings.batch_size, self.settings.seed + 1_000_003, list[np.ndarray]()
         for number, start in enumerate(range(0, len(self.held_out), size)):
             prompts = self.held_out[start : start + size]
-            answers = respond(self.roles, prompts, seed, number, 1)
+            answers = respond(self.roles, prompts, [seed, 8, number], 1)
             try:
                 scores = self.gold(prompts, answers, self._trainer_state())
             except RewardError as error:

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsFloat, TextIO
 
+from tightrope.language.generation.sample import texts_of
 from tightrope.maths import divergence
 from tightrope.maths.statistics import masked_mean, masked_sum
-from tightrope.runs.records import read_lines
+from tightrope.runs.records import in_lines, read_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from tightrope.language.reward.functions import Scores
 
 LONGEST = 300  # characters of a prompt or response in a table
+TEXT_WIDTH = 16  # characters of a column of text, at least
 
 
 def sample_rows(
@@ -32,18 +34,19 @@ def sample_rows(
     batch: Batch,
     valid: Tensor,
     step: int,
+    stop: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """One row per response of a rollout, in its order, as samples.jsonl holds them.
 
     ``step``: responses so far. ``prompt`` and ``response`` are text or messages; ``score`` the weighted sum
     and ``scores`` each function's own, None where there is none; ``kl`` to the reference in nats, k1 summed
     over the response; ``advantage`` the mean over its tokens, None where the response is masked (``counts``
-    False); ``tokens`` its length, ``ended`` whether it closed itself with an EOS; ``extras`` what reward
-    functions logged. ``batch`` holds only the rows of ``valid`` [B].
+    False); ``tokens`` its length, ``ended`` whether it closed itself, with an EOS or a text of ``stop``;
+    ``extras`` what reward functions logged. ``batch`` holds only the rows of ``valid`` [B].
     """
     responses = experience.responses
     log_ratio = experience.ref_logp - experience.logp
-    texts = [tokenizer.decode(ids, skip_special_tokens=True) for ids in experience.ids]
+    texts = texts_of(tokenizer, experience.ids, stop)
     places = {row: place for place, row in enumerate(valid.nonzero()[:, 0].tolist())}
     rows = []
     for index, (prompt, text) in enumerate(zip(prompts, texts, strict=True)):
@@ -139,12 +142,28 @@ def print_samples(
 def print_comparison(
     rows: Sequence[dict[str, Any]], stream: TextIO | None = None, *, width: int | None = None, title: str = ""
 ) -> None:
-    """A table of responses before and after training: rows of ``prompt``, ``before`` and ``after``.
+    """A table of responses before and after training: rows of ``prompt``, ``before`` and ``after``, and of
+    the figures that `sample_run` gives, as ``before > after``; below it their means.
 
     ``stream``, ``width`` and ``title`` as in `print_samples`.
     """
-    lines = [[row["prompt"], row["before"], row["after"]] for row in rows]
-    _print_table(["prompt", "before", "after"], [], lines, stream, width, title)
+    figures = [head for head in ("score", "kl", "tokens") if any(f"{head}_after" in row for row in rows)]
+
+    def change(name: str, pairs: list[tuple[float | None, float | None]]) -> str:
+        means = [[x for x in side if x is not None] for side in zip(*pairs, strict=True)]
+        return " > ".join(short_number(sum(side) / len(side) if side else None) for side in means)
+
+    pairs = {
+        name: [(row.get(f"{name}_before"), row.get(f"{name}_after")) for row in rows] for name in figures
+    }
+    lines = [
+        [row["prompt"], row["before"], row["after"], *(change(name, [pairs[name][i]]) for name in figures)]
+        for i, row in enumerate(rows)
+    ]
+    _print_table(["prompt", "before", "after"], figures, lines, stream, width, title)
+    if figures:
+        means = ", ".join(f"{name} {change(name, pairs[name])}" for name in figures)
+        print(f"mean of {len(rows)}, before > after: {means}", file=stream)
 
 
 def one_line(text: str | Sequence[Mapping[str, object]], *, tail: bool = False) -> str:
@@ -175,20 +194,35 @@ def _print_table(
     title: str = "",
     console: Console | None = None,
 ) -> None:
+    """Texts and figures side by side; below each other where the texts would be narrower than TEXT_WIDTH."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=title or None, title_justify="left", show_lines=True, highlight=False)
-    for name in texts:
-        table.add_column(Text(one_line(name)), ratio=1, overflow="fold")
-    for name in figures:
-        table.add_column(Text(one_line(name)), justify="right", no_wrap=True)
-    for prompt, *cells in lines:
-        shown = [one_line(x) if isinstance(x, str | list) else short_number(x) for x in cells]
-        # Text: brackets in a response are not markup
-        table.add_row(*map(Text, [one_line(prompt, tail=True), *shown]))
     console = console or Console(file=stream, width=width, markup=False, highlight=False)
+    heads = [one_line(name) for name in (*texts, *figures)]
+    rows = [
+        [one_line(line[0], tail=True)]
+        + [one_line(x) if isinstance(x, str | list) else short_number(x) for x in line[1:]]
+        for line in lines
+    ]
+    cells = [max(map(len, column)) + 3 for column in zip(heads, *rows, strict=True)][len(texts) :]
+    table = Table(title=title or None, title_justify="left", show_lines=True, highlight=False)
+    if console.width - sum(cells) < (TEXT_WIDTH + 3) * len(texts):
+        table.show_header = False
+        table.add_column(overflow="fold")
+        for row in rows:
+            pairs = [f"{head}: {cell}" for head, cell in zip(heads, row, strict=True)]
+            below = in_lines(pairs[len(texts) :], console.width - 4)
+            table.add_row(Text("\n".join([*pairs[: len(texts)], below]).rstrip()))
+        console.print(table)
+        return
+    for name in heads[: len(texts)]:
+        table.add_column(Text(name), ratio=1, overflow="fold")
+    for name in heads[len(texts) :]:
+        table.add_column(Text(name), justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row))  # Text: brackets in a response are not markup
     console.print(table)
 
 

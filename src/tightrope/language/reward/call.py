@@ -34,6 +34,12 @@ FaultKind = Literal["exception", "length", "type", "not finite", "timeout", "non
 LARGEST = 1e30  # above it a score, or a sum of weighted ones, would be infinite in float32
 
 
+IN_MAIN_THREAD = (
+    " It uses a signal (signal.alarm), which Python allows in the main thread alone, and a function with a "
+    "time limit runs in another one: give reward_timeout=None (--reward-timeout none), or leave its own out."
+)
+
+
 class RewardError(TightropeError, ValueError):
     """A reward function cannot be used as it is; the message names it and what to do."""
 
@@ -215,7 +221,8 @@ class _Call:
         elif isinstance(back, NoScores):
             fault(back.kind, range(self._count), str(back))
         elif isinstance(back, BaseException):
-            fault("exception", range(self._count), f"raised {describe_error(back)}.")
+            advice = IN_MAIN_THREAD if timeout is not None and _wants_main_thread(back) else ""
+            fault("exception", range(self._count), f"raised {describe_error(back)}.{advice}")
         if not isinstance(back, list):
             found.error = back
             return found
@@ -276,6 +283,15 @@ def describe_error(error: BaseException) -> str:
         return text
     line = [frame.lineno for frame in frames if frame.filename == frames[0].filename][-1]
     return f"{text} (line {line} of {Path(frames[0].filename).name})"
+
+
+def _wants_main_thread(error: BaseException | None) -> bool:
+    """Whether this error, or one that led to it, is that of a signal in another thread."""
+    while error is not None:
+        if "signal" in str(error) and "thread" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def samples_text(samples: Sequence[int] | np.ndarray, completions: Sequence[Text]) -> str:

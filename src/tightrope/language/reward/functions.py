@@ -10,6 +10,7 @@ it, or samples that are masked and counted, never a wrong number.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import importlib.util
 import inspect
 import itertools
@@ -233,8 +234,10 @@ def load_reward_function(word: str) -> RewardFunction:
         return length
     file, colon, name = word.rpartition(":")
     if not colon or not file.endswith(".py") or not name:
+        near = " Did you mean 'length'?" if difflib.get_close_matches(word, ["length"]) else ""
         raise RewardError(
-            f"The reward {word!r} is neither 'length' nor FILE.py:function, as in judge.py:score."
+            f"There is no reward {word!r}. Looked for: 'length', FILE.py:function, as in judge.py:score, and "
+            f"the folder of a reward model (none of that name).{near}"
         )
     path = Path(file)
     if not path.is_file():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,9 +14,10 @@ from torch import Tensor
 
 from tightrope.algorithms.descent import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
-from tightrope.language.generation.sample import Completions
+from tightrope.language.generation.sample import Completions, texts_of
 from tightrope.language.model import lora
 from tightrope.language.model.load import known_ids, read_metadata, read_tensors, weights_fingerprint
+from tightrope.language.model.packaged import not_on_hub
 from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.call import Fault, RewardError, RewardFunction
@@ -26,6 +29,7 @@ from tightrope.language.reward.functions import (
     unique_name,
 )
 from tightrope.language.reward.model import RewardModel, last_real, load_reward
+from tightrope.language.settings import AlignSettings, weighted
 
 # What a user may give: a function, the words of the command line, or the folder of a reward model; alone or
 # with its weight, or several in a list.
@@ -75,7 +79,7 @@ class Judge:
     def _of_functions(self, prompts: Sequence[Prompt], answers: Completions, state: object) -> Scores | None:
         if self.functions is None:
             return None
-        texts = [str(self.roles.tokenizer.decode(row, skip_special_tokens=True)) for row in answers.ids]
+        texts = texts_of(self.roles.tokenizer, answers.ids, self.roles.settings.stop)
         completions = [
             text if isinstance(prompt.shown, str) else [{"role": "assistant", "content": text}]
             for prompt, text in zip(prompts, texts, strict=True)
@@ -154,9 +158,36 @@ def _entries(reward: RewardSources) -> list[GivenReward]:
         weight = 1.0
         if isinstance(given, tuple) and len(given) == 2:
             word, weight = given[0], checked_weight(given[1])
-        folder = Path(word) if isinstance(word, str | Path) and Path(word).is_dir() else None
+        if isinstance(word, str):
+            word, typed = weighted(word)
+            weight *= checked_weight(typed)
+        folder = _folder(word) if isinstance(word, str | Path) else None
         found.append(GivenReward(word, weight, folder))
     return found
+
+
+def _folder(word: str | Path) -> Path | None:
+    """The folder of a reward model: the one named, or that of a hub id, whose files are fetched; None for
+    what names neither.
+    """
+    path = Path(word).expanduser()
+    if path.is_dir():
+        return path
+    return _from_hub(str(word)) if re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", str(word)) else None
+
+
+@functools.cache
+def _from_hub(word: str) -> Path:
+    """A hub model's folder on this machine. RewardError, with what was looked for, where there is none."""
+    if reason := not_on_hub(word):
+        raise RewardError(
+            f"There is no reward {word!r}. Looked for: {', '.join(AlignSettings.BUILT_IN_REWARDS)}, "
+            "FILE.py:function, the folder of a reward model (none of that name), and a reward model of that "
+            f"id on the hub ({reason})."
+        )
+    from huggingface_hub import snapshot_download
+
+    return Path(snapshot_download(word, allow_patterns=["*.json", "*.safetensors", "*.model", "*.txt"]))
 
 
 def folder_of(reward: RewardSources) -> Path | None:
@@ -183,7 +214,7 @@ def make_judge(reward: RewardSources, roles: Roles, *, on_trunk: Path | None, ti
     """
     functions: list[Any] = []
     model, adapter, model_weight = None, None, 1.0
-    if isinstance(reward, str) and not reward:
+    if reward in ("", []):
         raise ValueError(
             "There is no reward. Give a function, 'length', FILE.py:function or the folder of a reward model."
         )
