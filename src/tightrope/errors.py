@@ -12,6 +12,7 @@
     ├── DoesNotFit                      ValueError          a job needs more memory than there is
     ├── EnvironmentFault                RuntimeError        an environment failed, hung or died
     ├── ApiBreak                                            internal: becomes an EnvironmentFault
+    ├── WrongWeights                    ValueError          weights of a model are missing, or do not fit
     ├── RewardError                     ValueError          a reward function cannot be used
     └── NoScores                                            internal: becomes a masked sample
 

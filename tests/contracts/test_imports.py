@@ -75,7 +75,8 @@ MAY_IMPORT = {
 }
 ANYTHING_OF = {"cli": ("control.", "language.")}  # the command line may use every room of the stories
 LONGEST_CHAIN = {"control.": 8, "language.": 8}
-MOST_ENTRIES, MOST_FILES = 14, 122
+# 123rd: language/model/weights.py, because load.py, which refuses files, would exceed its own limit with it
+MOST_ENTRIES, MOST_FILES = 14, 123
 HEAVY = ("torch", "gymnasium", "numba", "scipy", "rich", "numpy", "safetensors", "transformers")
 START_SECONDS = 0.5  # in processor time, which does not depend on other load
 

@@ -18,12 +18,14 @@ from tightrope.language.data.examples import read_prompts
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.generation.sample import log_ratio_limit
 from tightrope.language.model.load import known_ids, quiet_libraries, unreadable, unwritable
+from tightrope.language.model.weights import WrongWeights
 from tightrope.language.policy.policy_model import Experience, PolicyModel
 from tightrope.language.policy.roles import Roles, make_roles
 from tightrope.language.reward.functions import Scores
 from tightrope.language.settings import AlignSettings, RLHFSettings
 
 WORDS = ("The", "Once upon a time there was", "I think that", "a b c d e f g h")
+WEIGHTS = "every weight is the file's"
 GRADIENT_LIMIT = 1e-3  # relative, of the norm: float32 sums in another order
 
 
@@ -34,7 +36,11 @@ def check_model(model: str, dtype: str = "float32") -> list[Finding]:
         model=model, dtype=dtype, lora_rank=4, batch_size=8, samples_per_prompt=2, max_new_tokens=12,
         max_prompt_tokens=16, update=RLHFSettings(minibatch_size=8, num_epochs=1, normalise_advantages=False),
     )  # fmt: skip
-    roles = make_roles(settings, notify=lambda text: None)
+    told: list[str] = []
+    try:
+        roles = make_roles(settings, notify=lambda text: None, warn=told.append)
+    except WrongWeights as error:
+        return [Finding(WEIGHTS, False, error.seen, error.advice)]
     prompts = read_prompts(
         list(WORDS), roles.tokenizer, max_tokens=16, vocabulary=known_ids(roles.model),
         notify=lambda text: None,
@@ -44,6 +50,7 @@ def check_model(model: str, dtype: str = "float32") -> list[Finding]:
     rewards = rewards_of(experience, scores, settings, settings.kl_beta).rewards
     batch = batch_of(experience, rewards, torch.ones(8, dtype=torch.bool), settings)
     return [
+        Finding(WEIGHTS, True, told[0] if told else "none is missing and none is left over"),
         _vocabulary(roles),
         _same_logits(roles, experience),
         _same_policy(roles, experience),

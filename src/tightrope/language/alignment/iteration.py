@@ -120,6 +120,7 @@ class Trainer:
             settings,
             on_trunk,
             listeners.info,
+            warn=listeners.warn,
             own_reward=on_trunk is None and folder_of(reward) is not None,
         )
         self.prompts = self._read_prompts(prompts)

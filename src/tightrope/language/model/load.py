@@ -13,7 +13,7 @@ import hashlib
 import json
 import stat
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.model.architecture import parts
+from tightrope.language.model.weights import require_weights
 from tightrope.runs.records import each_key_once
 
 if TYPE_CHECKING:
@@ -71,14 +72,16 @@ def load_tokenizer(folder: str) -> PreTrainedTokenizerBase:
     return pretrained(AutoTokenizer, folder)
 
 
-def load_causal(folder: str, dtype: torch.dtype = torch.float32) -> Any:
+def load_causal(
+    folder: str, dtype: torch.dtype = torch.float32, notify: Callable[[str], None] = warnings.warn
+) -> Any:
     """The model, ready to sample and to train: dropout is 0 in every module, so that both see one policy.
 
-    Raises ValueError for a model that `parts` refuses.
+    Raises ValueError for a model that `parts` refuses, and WrongWeights, which is one, as `pretrained` does.
     """
     from transformers import AutoModelForCausalLM
 
-    model = fused(pretrained, AutoModelForCausalLM, folder, dtype=dtype)
+    model = fused(pretrained, AutoModelForCausalLM, folder, notify=notify, dtype=dtype)
     without_dropout(model)
     parts(model.eval())
     return model
@@ -165,20 +168,30 @@ def never_drawn(
     return tuple(sorted(stops.union(strangers) if ignore_eos else strangers))
 
 
-def pretrained(kind: Any, folder: str | Path, **options: object) -> Any:
+def pretrained(
+    kind: Any,
+    folder: str | Path,
+    *,
+    notify: Callable[[str], None] = warnings.warn,
+    read: Collection[str] = (),
+    **options: object,
+) -> Any:
     """``kind.from_pretrained(folder)`` for any of transformers' Auto classes: a folder or a hub id.
 
     Code of the folder is never run: trust_remote_code is off, and a model that names code is refused.
-    ValueError, with the reason, for what cannot be loaded.
+    ValueError, with the reason, for what cannot be loaded; WrongWeights as `require_weights`, which gets
+    ``notify`` and ``read``.
     """
-    import torch
-
     refuse_code(folder)
     refuse_places(folder)
-    if kind.__name__.startswith("AutoModel") and "gguf_file" not in options:
-        options["use_safetensors"] = True  # the other format is pickle
+    is_model = kind.__name__.startswith("AutoModel")
+    if is_model:
+        # a wrong shape is in the report then; the error that transformers raises does not name it
+        options |= {"output_loading_info": True, "ignore_mismatched_sizes": True}
+        if "gguf_file" not in options:
+            options["use_safetensors"] = True  # the other format is pickle
     try:
-        return kind.from_pretrained(str(folder), trust_remote_code=False, **options)
+        found = kind.from_pretrained(str(folder), trust_remote_code=False, **options)
     except (MemoryError, torch.OutOfMemoryError):
         raise
     except Exception as error:  # transformers, tokenizers and safetensors raise many kinds
@@ -190,9 +203,16 @@ def pretrained(kind: Any, folder: str | Path, **options: object) -> Any:
                 "model.save_pretrained(FOLDER) of a recent transformers writes safetensors."
             )
         reason = (str(error).strip().splitlines() or [""])[0]
+        if "conversion of the weights" in reason:  # it goes on: "see the report", which is not shown
+            reason = "weights that belong together, such as those of a layer's experts, are not all there"
         raise ValueError(
             f"{folder} cannot be loaded by {kind.__name__} ({type(error).__name__}: {reason}). {advice}"
         ) from error
+    if not is_model:
+        return found
+    model, report = found
+    require_weights(model, report, str(folder), notify, read)
+    return model
 
 
 def without_weights(kind: Any, config: PreTrainedConfig, **options: object) -> Any:

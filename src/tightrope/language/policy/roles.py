@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,23 +131,25 @@ def make_roles(
     reward_adapter: Path | None = None,
     notify: Callable[[str], None] = print,
     *,
+    warn: Callable[[str], None] = warnings.warn,
     own_reward: bool = False,
 ) -> Roles:
     """Load and arrange the models. ``reward_adapter``: a reward model's adapter for the same trunk;
     ``own_reward``: the reward is a model with a trunk of its own, which will be loaded beside them.
 
     The memory ledger is handed to ``notify`` before anything large is loaded; what cannot fit is a
-    ValueError.
+    ValueError. ``warn`` is told of weights in the file that are not used.
     """
     require_device(settings.device)
     folder, dtype, device = find_model(settings.model), getattr(torch, settings.dtype), settings.device
     guessed = own_reward and not any(Path(weighted(word)[0]).is_dir() for word in settings.reward)
     kind = "separate" if guessed else "none" if reward_adapter is None else "adapter"
     _require_memory(folder, settings, kind, notify, own_reward)
-    tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype).to(device)
+    tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype, warn).to(device)
     stops, cut = eos_ids(model, tokenizer), 0
     if strangers := unreadable(model, tokenizer):
         notify(strangers)
+    again = functools.partial(load_causal, folder, dtype, lambda text: None)  # what it tells was told above
     if settings.tune == "lora":
         layers = lora.top_layers(model, settings.lora_layers)
         cut = layers[0]
@@ -160,13 +163,13 @@ def make_roles(
     trunk = Trunk(model, cut, checkpointing=checkpointing)
     policy, reference = Role(trunk, "policy"), Role(trunk)
     if settings.tune == "full":
-        copy = load_causal(folder, dtype).to(device).requires_grad_(False)
+        copy = again().to(device).requires_grad_(False)
         policy, reference = Role(trunk), Role(Trunk(copy))
     critic = None
     if settings.critic == "adapter":
         critic = Role(trunk, "critic")
     elif settings.critic == "separate":
-        critic = Role(Trunk(load_causal(folder, dtype).to(device), checkpointing=checkpointing))
+        critic = Role(Trunk(again().to(device), checkpointing=checkpointing))
     head = None
     if settings.critic != "none":
         head = nn.Linear(model.config.hidden_size, 1).to(device)

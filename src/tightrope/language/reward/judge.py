@@ -16,7 +16,7 @@ from tightrope.algorithms.descent import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions, texts_of
 from tightrope.language.model import lora
-from tightrope.language.model.load import known_ids, read_metadata, read_tensors, weights_fingerprint
+from tightrope.language.model.load import known_ids, read_metadata, weights_fingerprint
 from tightrope.language.model.packaged import not_on_hub
 from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
@@ -28,7 +28,7 @@ from tightrope.language.reward.functions import (
     load_reward_function,
     unique_name,
 )
-from tightrope.language.reward.model import RewardModel, last_real, load_reward
+from tightrope.language.reward.model import HEAD, RewardModel, last_real, load_reward, read_head
 from tightrope.language.settings import AlignSettings, weighted
 
 # What a user may give: a function, the words of the command line, or the folder of a reward model; alone or
@@ -198,12 +198,12 @@ def folder_of(reward: RewardSources) -> Path | None:
 def reward_adapter(reward: RewardSources) -> Path | None:
     """The adapter folder of a reward model that was trained with LoRA, None for any other reward."""
     folders = [entry.folder / "adapter" for entry in _entries(reward) if entry.folder is not None]
-    return next((folder for folder in folders if (folder / "head.safetensors").is_file()), None)
+    return next((folder for folder in folders if (folder / HEAD).is_file()), None)
 
 
 def shares_trunk(adapter: Path, model: str) -> bool:
     """Whether a reward adapter was trained on the same weights that are aligned, in any folder."""
-    trained = read_metadata(adapter / "head.safetensors").get("trunk")
+    trained = read_metadata(adapter / HEAD).get("trunk")
     return bool(trained) and trained == weights_fingerprint(model)
 
 
@@ -224,7 +224,8 @@ def make_judge(reward: RewardSources, roles: Roles, *, on_trunk: Path | None, ti
                 raise ValueError("Two reward models were given; expected one, and any number of functions.")
             model_weight = entry.weight
             if on_trunk is not None and entry.folder / "adapter" == on_trunk:
-                adapter = read_head(on_trunk, roles)
+                weight, shift = read_head(on_trunk / HEAD, roles.model.config.get_text_config().hidden_size)
+                adapter = weight.to(roles.settings.device), shift
             else:
                 model = load_reward(entry.folder).to(roles.settings.device)
                 _same_tokens(model, roles, entry.folder)
@@ -240,20 +241,6 @@ def make_judge(reward: RewardSources, roles: Roles, *, on_trunk: Path | None, ti
     alone = model is None and adapter is None
     rewards = Rewards(functions, timeout=timeout, alone=alone) if functions else None
     return Judge(roles, rewards, model, adapter, model_weight)
-
-
-def read_head(adapter: Path, roles: Roles) -> tuple[Tensor, float]:
-    """The score head [1, d] and the shift that lie beside a reward adapter."""
-    tensors = read_tensors(adapter / "head.safetensors")
-    width = roles.model.config.hidden_size
-    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    if shapes != {"score.weight": (1, width), "shift": ()}:
-        raise ValueError(
-            f"{adapter / 'head.safetensors'} holds {shapes}, expected score.weight (1, {width}) and a shift. "
-            "Train the reward model again: tightrope reward."
-        )
-    head = tensors["score.weight"].to(next(roles.model.parameters()).device)
-    return head, float(tensors["shift"])
 
 
 def _same_tokens(model: RewardModel, roles: Roles, folder: Path) -> None:

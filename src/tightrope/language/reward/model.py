@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +17,7 @@ from tightrope.language.model.load import (
     pretrained,
     quiet_libraries,
     read_object,
+    read_tensors,
     without_dropout,
 )
 
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerBase
 
 SHIFT = "tightrope_reward_shift"  # in config.json: score = output of the head - shift
+HEAD = "head.safetensors"  # score.weight [1, d] and shift: beside an adapter, or beside a bare trunk
+BIAS = "score.bias"
 
 
 def last_real(hidden: Tensor, real: Tensor) -> Tensor:
@@ -62,14 +67,37 @@ class RewardModel:
         return self.raw(tokens, real) - self.shift
 
 
-@quiet_libraries()
-def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> RewardModel:
-    """A reward model from a run folder of ``tightrope reward``, or from any folder that
-    AutoModelForSequenceClassification loads with one label and a head called ``score``.
+def read_head(path: Path, width: int) -> tuple[Tensor, float]:
+    """The score head [1, width] and the shift in a file called HEAD. ValueError for anything else."""
+    tensors = read_tensors(path)
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    if shapes != {"score.weight": (1, width), "shift": ()}:
+        raise ValueError(
+            f"{path} holds {shapes}, expected score.weight (1, {width}) and a shift. Train the reward model "
+            "again: tightrope reward."
+        )
+    return tensors["score.weight"], float(tensors["shift"])
 
-    ValueError when there is none, or when the folder holds another kind of model.
+
+def write_head(path: Path, weight: Tensor, shift: float, trunk: str | None = None) -> None:
+    """Write what `read_head` reads; ``trunk``: the fingerprint of the weights that it belongs to."""
+    from safetensors.torch import save_file
+
+    tensors = {"score.weight": weight.detach().cpu(), "shift": torch.tensor(shift, dtype=torch.float64)}
+    save_file(tensors, path, metadata={"trunk": trunk} if trunk else None)
+
+
+@quiet_libraries()
+def load_reward(
+    folder: str | Path, dtype: torch.dtype = torch.float32, notify: Callable[[str], None] = warnings.warn
+) -> RewardModel:
+    """A reward model from a run folder of ``tightrope reward``, from its folder ``model``, or from any
+    folder that AutoModelForSequenceClassification loads with one label and a linear head called ``score``.
+
+    ValueError when there is none, or when the folder holds another kind of model; WrongWeights, which is one,
+    when weights are missing. ``notify`` is told of weights that are not used.
     """
-    from transformers import AutoModelForSequenceClassification
+    from transformers import AutoModel
 
     path = Path(folder)
     path = path / "model" if (path / "model" / "config.json").is_file() else path
@@ -77,18 +105,49 @@ def load_reward(folder: str | Path, dtype: torch.dtype = torch.float32) -> Rewar
         raise ValueError(
             f"{folder} is not a reward model: it holds no config.json. Train one: tightrope reward."
         )
+    if (path / HEAD).is_file():
+        base = fused(pretrained, AutoModel, path, notify=notify, dtype=dtype)
+        weight, shift = read_head(path / HEAD, base.config.get_text_config().hidden_size)
+        head = nn.Linear(weight.shape[1], 1, bias=False).to(dtype)
+        head.weight.data = weight.to(dtype)
+    else:
+        model = _classifier(path, dtype, notify)
+        base, head = getattr(model, model.base_model_prefix), model.score
+        shift = float(getattr(model.config, SHIFT, 0.0)) - _take_bias(head, path)
+    without_dropout(base.eval())
+    return RewardModel(base, head, shift, load_tokenizer(str(path)))
+
+
+def _classifier(path: Path, dtype: torch.dtype, notify: Callable[[str], None]) -> Any:
+    """A model of AutoModelForSequenceClassification with one label and a linear head called ``score``."""
+    from transformers import AutoModelForSequenceClassification
+
     kinds = read_object(path / "config.json").get("architectures") or ["nothing named"]
-    if not kinds[0].endswith("ForSequenceClassification"):  # loading would make up a head
+    if not kinds[0].endswith("ForSequenceClassification"):
         raise ValueError(
-            f"{folder} holds {kinds[0]}, which gives no scores. Train a reward model: tightrope reward."
+            f"{path} holds {kinds[0]}, which gives no scores. Train a reward model: tightrope reward."
         )
-    model = fused(pretrained, AutoModelForSequenceClassification, path, dtype=dtype)
-    head = getattr(model, "score", None)
-    if model.config.num_labels != 1 or not isinstance(head, nn.Linear):
+    model = fused(
+        pretrained, AutoModelForSequenceClassification, path, notify=notify, read=(BIAS,), dtype=dtype
+    )
+    if model.config.num_labels != 1 or not isinstance(getattr(model, "score", None), nn.Linear):
         raise ValueError(
-            f"{folder} is {kinds[0]} with {model.config.num_labels} labels; expected one label and a linear "
+            f"{path} is {kinds[0]} with {model.config.num_labels} labels; expected one label and a linear "
             "head called score. Wrap it in a reward function."
         )
-    without_dropout(model)
-    base = getattr(model.eval(), model.base_model_prefix)
-    return RewardModel(base, head, float(getattr(model.config, SHIFT, 0.0)), load_tokenizer(str(path)))
+    return model
+
+
+def _take_bias(head: nn.Linear, path: Path) -> float:
+    """The bias of a score head, which is taken off: the head's own, or one in the file of a model whose class
+    gives its head none. 0.0 where there is none.
+    """
+    from safetensors import safe_open
+
+    bias: Tensor | None = head.bias
+    for file in sorted(path.glob("*.safetensors")) if bias is None else ():
+        with safe_open(file, "pt") as tensors:
+            if BIAS in set(tensors.keys()):
+                bias = tensors.get_tensor(BIAS)
+    head.register_parameter("bias", None)
+    return 0.0 if bias is None else float(bias.detach())

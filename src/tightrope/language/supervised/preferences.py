@@ -24,7 +24,7 @@ from tightrope.language.model import lora
 from tightrope.language.model.architecture import parts
 from tightrope.language.model.load import known_ids, weights_fingerprint, without_weights
 from tightrope.language.model.saving import save_adapter
-from tightrope.language.reward.model import SHIFT, RewardModel
+from tightrope.language.reward.model import HEAD, SHIFT, RewardModel, write_head
 from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised.fit import Objective, Stage, micro_batches, resume_stage, train_stage
 from tightrope.language.supervised.prepare import GivenModel, Loaded, examples_of, precision
@@ -119,8 +119,9 @@ def train_reward(
     ``data`` and ``validation`` replace the files that the settings name: rows in any format of
     `preference_pairs`; ``demonstrations``: rows of `sft_examples`. ``model``: a causal (model, tokenizer),
     whose trunk is trained in place. The run folder holds settings.json, metrics.jsonl, summary.json (with the
-    calibration table) and ``model``, which AutoModelForSequenceClassification.from_pretrained loads; tuned by
-    LoRA also ``adapter``, which PEFT loads and alignment puts on its own trunk.
+    calibration table) and ``model``, which AutoModelForSequenceClassification.from_pretrained loads, or
+    AutoModel with the head in a file where transformers has no such class for the architecture; tuned by LoRA
+    also ``adapter``, which PEFT loads and alignment puts on its own trunk.
     Raises ValueError for data or settings that cannot work, before anything is trained, and DoesNotFit, which
     is one, for too little memory, before the model is loaded.
     """
@@ -146,7 +147,7 @@ def _objective(
     settings: RewardSettings, loaded: Loaded, given: Mapping[str, Rows | None], listeners: Listeners
 ) -> Objective:
     base, size = parts(loaded.model).base, settings.micro_batch_size or settings.minibatch_size
-    head = make_head(loaded.model.config.hidden_size, settings.seed).to(settings.device)
+    head = make_head(loaded.model.config.get_text_config().hidden_size, settings.seed).to(settings.device)
     model, skeleton = RewardModel(base, head, 0.0, loaded.tokenizer), reward_skeleton(loaded)
     pairs, held, texts = _data(settings, loaded, given, listeners)
 
@@ -172,7 +173,9 @@ def _objective(
         table = calibration(held_out())[1] if held else []
         with precision(settings):
             mean, deviation = normalise(model, texts, size)
-        save_reward(skeleton, loaded, head.weight, model.shift, folder, newest)
+        refused = save_reward(skeleton, loaded, head.weight, model.shift, folder, newest)
+        if refused:
+            listeners.warn(f"{folder / 'adapter'}: {refused}")
         return {
             "pairs": len(pairs),
             "held_out_pairs": len(held),
@@ -215,8 +218,15 @@ def _data(
 
 
 def reward_skeleton(loaded: Loaded) -> Any:
-    """The model class that scores with this trunk, without weights; made early, to learn if there is one."""
-    from transformers import AutoModelForSequenceClassification
+    """A model without weights that holds what is saved, made early, to learn if there is one: the class of
+    AutoModelForSequenceClassification that scores with this trunk through a bias-free head called ``score``,
+    where transformers has one; otherwise the bare trunk, which AutoModel loads.
+    """
+    from transformers import (
+        MODEL_FOR_SEQUENCE_CLASSIFICATION_MAPPING,
+        AutoModel,
+        AutoModelForSequenceClassification,
+    )
 
     config = copy.deepcopy(loaded.model.config)
     config.num_labels = 1
@@ -224,46 +234,63 @@ def reward_skeleton(loaded: Loaded) -> Any:
         # transformers reads the score before the first padding id: where that is the EOS too, it would read
         # another token than the last one, silently. Without a padding id it refuses batches instead.
         config.pad_token_id = None
-    with torch.device("meta"):
-        skeleton = without_weights(AutoModelForSequenceClassification, config)
-    if not isinstance(getattr(skeleton, "score", None), nn.Linear) or skeleton.score.bias is not None:
-        raise ValueError(
-            f"{type(skeleton).__name__} has no bias-free head called score, so that a reward model of it "
-            "would not load elsewhere. Llama, Qwen, Mistral, GPT-2 and similar models have one."
-        )
-    return skeleton
+    scores = type(config) in MODEL_FOR_SEQUENCE_CLASSIFICATION_MAPPING
+    for kind in (AutoModelForSequenceClassification, AutoModel) if scores else (AutoModel,):
+        with torch.device("meta"):
+            skeleton = without_weights(kind, config)
+        if skeleton.state_dict().keys() == _state_of(skeleton, loaded, None, torch.empty(0)).keys():
+            return skeleton
+    raise ValueError(
+        f"{type(loaded.model).__name__} names its weights as no class of transformers does that could score "
+        "texts, so that a reward model of it could not be loaded again. Choose another model."
+    )
+
+
+def _state_of(skeleton: Any, loaded: Loaded, adapter: str | None, head: Tensor) -> dict[str, Tensor]:
+    """The weights of the trunk, an adapter folded in, by a skeleton's names; with a head if it has one."""
+    prefix = f"{loaded.model.base_model_prefix}."
+    merged = lora.merged_state(loaded.model, adapter)
+    state = {name: tensor.cpu() for name, tensor in merged.items() if name.startswith(prefix)}
+    if _has_head(skeleton):
+        return {**state, "score.weight": head.cpu()}
+    return {name.removeprefix(prefix): tensor for name, tensor in state.items()}
+
+
+def _has_head(skeleton: Any) -> bool:
+    return isinstance(getattr(skeleton, "score", None), nn.Linear)
 
 
 def save_reward(
     skeleton: Any, loaded: Loaded, head: Tensor, shift: float, path: Path, final: dict[str, float]
-) -> None:
-    """RUN/model for AutoModelForSequenceClassification.from_pretrained, and the adapter where there is one.
+) -> str | None:
+    """RUN/model for AutoModelForSequenceClassification.from_pretrained, or a bare trunk with its head in a
+    file, and the adapter where there is one. Returns why PEFT does not open the adapter; None where it does.
 
     ``head`` [1, d] with the gain folded in; ``shift`` is what has to be subtracted from its scores.
     """
-    from safetensors.torch import save_file
-
-    prefix, head = f"{loaded.model.base_model_prefix}.", head.detach().contiguous()
-    merged = lora.merged_state(loaded.model, loaded.adapter)
-    state = {name: tensor for name, tensor in merged.items() if name.startswith(prefix)}
-    state = {name: tensor.cpu() for name, tensor in {**state, "score.weight": head}.items()}
-    skeleton.load_state_dict(state, strict=True, assign=True)
+    head, scores = head.detach().contiguous(), _has_head(skeleton)
+    skeleton.load_state_dict(_state_of(skeleton, loaded, loaded.adapter, head), strict=True, assign=True)
     setattr(skeleton.config, SHIFT, shift)
     with atomic_folder(path / "model") as folder:
         skeleton.save_pretrained(folder)
         loaded.tokenizer.save_pretrained(folder)
-        (folder / "README.md").write_text(card(shift, loaded.source, final), encoding="utf-8")
-    if loaded.adapter is not None:
-        with atomic_folder(path / "adapter") as folder:
-            save_adapter(loaded.model, loaded.adapter, folder, base_model=loaded.source, score=head)
-            # the head with its shift, for alignment
-            shifted = {"score.weight": head.cpu(), "shift": torch.tensor(shift, dtype=torch.float64)}
-            trunk = weights_fingerprint(loaded.source)
-            save_file(shifted, folder / "head.safetensors", metadata={"trunk": trunk} if trunk else None)
+        text = card(shift, loaded.source, final, scores=scores)
+        (folder / "README.md").write_text(text, encoding="utf-8")
+        if not scores:
+            write_head(folder / HEAD, head, shift)
+    if loaded.adapter is None:
+        return None
+    with atomic_folder(path / "adapter") as folder:
+        score = head if scores else None
+        refused = save_adapter(loaded.model, loaded.adapter, folder, base_model=loaded.source, score=score)
+        write_head(folder / HEAD, head, shift, weights_fingerprint(loaded.source))  # for alignment
+    return refused
 
 
-def card(shift: float, source: str, final: dict[str, float]) -> str:
-    """The model card: how the folder is loaded, and what has to be subtracted by hand elsewhere."""
+def card(shift: float, source: str, final: dict[str, float], *, scores: bool = True) -> str:
+    """The model card: how the folder is loaded, and what has to be subtracted by hand elsewhere. ``scores``:
+    transformers has a class that does.
+    """
     accuracy, error = (final.get(f"reward/{name}") for name in ("held_out_accuracy", "calibration_error"))
     measured = "Nothing was held out, so its accuracy is not known."
     if accuracy is not None and error is not None:
@@ -272,16 +299,37 @@ def card(shift: float, source: str, final: dict[str, float]) -> str:
 
 Trained by Bradley-Terry on preferences, from {"/".join(Path(source).parts[-2:])}. {measured}
 
-```python
+{(WITH_CLASS if scores else WITHOUT_CLASS).format(shift=repr(shift), name=SHIFT)}"""
+
+
+WITH_CLASS = """```python
 from transformers import AutoModelForSequenceClassification
 
 model = AutoModelForSequenceClassification.from_pretrained("this/folder", num_labels=1)
-score = model(input_ids).logits[:, 0] - ({shift!r})
+score = model(input_ids).logits[:, 0] - ({shift})
 ```
 
-Scores have mean 0 and deviation 1 on demonstrations **after the shift {shift!r} is subtracted**. It is stored
-in config.json as `{SHIFT}`; tightrope subtracts it, other programs do not. The gain is part of the head.
+Scores have mean 0 and deviation 1 on demonstrations **after the shift {shift} is subtracted**. It is stored
+in config.json as `{name}`; tightrope subtracts it, other programs do not. The gain is part of the head.
 
 The score is read at the last token of a text, which should be its end-of-sequence token. Pad on the right,
 with the `pad_token_id` of config.json; where that is null, score one text at a time.
+"""
+
+WITHOUT_CLASS = """transformers has no class that scores texts with this architecture. The folder holds the
+model without a head, and `head.safetensors` the head and its shift:
+
+```python
+from safetensors.torch import load_file
+from transformers import AutoModel
+
+model, head = AutoModel.from_pretrained("this/folder"), load_file("this/folder/head.safetensors")
+hidden = model(input_ids, use_cache=False).last_hidden_state[:, -1]
+score = (hidden @ head["score.weight"].T)[:, 0] - head["shift"]
+```
+
+Scores have mean 0 and deviation 1 on demonstrations **after the shift {shift} is subtracted**.
+
+The score is read at the last token of a text, which should be its end-of-sequence token. Score one text at a
+time, or take the hidden state of each text's own last token.
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -63,7 +64,7 @@ def prepared(
     require_device(settings.device)
     with threads(settings.threads), signals.stoppable():
         _require_memory(settings, given, listeners)
-        loaded = load_for_training(settings, adapter, given)
+        loaded = load_for_training(settings, adapter, given, listeners.warn)
         if strangers := unreadable(loaded.model, loaded.tokenizer):
             listeners.info(strangers)
         with lora.using(loaded.model, loaded.adapter):
@@ -83,7 +84,12 @@ def _require_memory(settings: SupervisedSettings, given: GivenModel | None, list
     require_memory(config, job_of(settings), place, listeners.info, held)
 
 
-def load_for_training(settings: SupervisedSettings, adapter: str, given: GivenModel | None = None) -> Loaded:
+def load_for_training(
+    settings: SupervisedSettings,
+    adapter: str,
+    given: GivenModel | None = None,
+    notify: Callable[[str], None] = warnings.warn,
+) -> Loaded:
     """Load the settings' model, or take a (model, tokenizer) that is given and train it in place.
 
     Tuned in full, the weights stay float32 with any ``dtype``: a step of 1e-5 is lost on a bfloat16
@@ -94,7 +100,7 @@ def load_for_training(settings: SupervisedSettings, adapter: str, given: GivenMo
     else:
         source = find_model(settings.model)
         dtype = torch.float32 if settings.tune == "full" else getattr(torch, settings.dtype)
-        given = load_causal(source, dtype), load_tokenizer(source)
+        given = load_causal(source, dtype, notify), load_tokenizer(source)
     model: Any = given[0]  # mypy cannot call the `to` of transformers
     tokenizer = given[1]
     limit = context_length(model)
