@@ -2,13 +2,42 @@
 
 import pytest
 import torch
-from language.tiny import padded, tiny_gpt2, tiny_llama
+from language.tiny import padded, tiny_gpt2, tiny_llama, tiny_of
 
-from tightrope.language.model import lora
+from tightrope.language.model import lora, saving
 from tightrope.language.model.saving import load_adapter, save_adapter
 from tightrope.language.model.trunk import Trunk
 
 MODELS = [tiny_llama, tiny_gpt2]
+EXPERTS = {
+    "n_routed_experts": 4, "num_experts_per_tok": 2, "moe_intermediate_size": 16, "n_shared_experts": 1,
+    "first_k_dense_replace": 1, "n_group": 1, "topk_group": 1,
+}  # fmt: skip
+LATENT = {
+    **EXPERTS, "kv_lora_rank": 8, "q_lora_rank": 8, "qk_nope_head_dim": 8, "qk_rope_head_dim": 8,
+    "v_head_dim": 8,
+}  # fmt: skip
+LINEAR = {
+    "linear_num_key_heads": 2, "linear_num_value_heads": 4, "linear_key_head_dim": 8,
+    "linear_value_head_dim": 8,
+}  # fmt: skip
+STATE = {"mamba_d_state": 8, "mamba_d_head": 16, "mamba_n_heads": 2, "mamba_n_groups": 1, "mamba_d_ssm": 32}
+# Shared experts and dense layers beside fused experts; names that other modules have too (Zamba2: "0").
+HARD = {
+    "deepseek2": ("DeepseekV2", {**LATENT, "topk_method": "greedy"}),
+    "deepseek3": ("DeepseekV3", LATENT),
+    "glm4moe": ("Glm4Moe", {**EXPERTS, "head_dim": 8}),
+    "qwen3next": (
+        "Qwen3Next", {**EXPERTS, **LINEAR, "num_experts": 4, "head_dim": 8, "num_hidden_layers": 4,
+                      "shared_expert_intermediate_size": 16},
+    ),
+    "mixtral": ("Mixtral", {"num_local_experts": 4}),
+    "zamba2": (
+        "Zamba2", {"num_mem_blocks": 1, "mamba_headdim": 16, "n_mamba_heads": 2, "mamba_d_state": 8,
+                   "mamba_ngroups": 1, "chunk_size": 8, "use_shared_mlp_adapter": True, "adapter_rank": 4,
+                   "layers_block_type": ["mamba", "hybrid", "mamba"]},
+    ),
+}  # fmt: skip
 
 
 def adapted(make, *names, layers=None):
@@ -102,6 +131,64 @@ def test_peft_opens_a_saved_adapter(make, tmp_path):
     theirs = peft.PeftModel.from_pretrained(make(), str(tmp_path))
     got = theirs(input_ids=tokens, attention_mask=real.long()).logits
     torch.testing.assert_close(got[real], wanted[real], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", HARD)
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore:.*is_gradient_checkpointing.*:FutureWarning")
+def test_peft_gives_what_was_trained_on_families_whose_targets_it_rewrites(name, tmp_path):
+    """huggingface/peft #3711: it gave shared experts and dense layers of these no adapter."""
+    peft = pytest.importorskip("peft")
+    kind, values = HARD[name]
+    tokens = padded()[0]
+    model = tiny_of(kind, **values)
+    lora.add_adapter(model, "policy", 4, 8.0, (1, 2), 0)
+    with torch.no_grad():
+        bare = model(input_ids=tokens, use_cache=False).logits
+        shake(model, "policy")
+        assert save_adapter(model, "policy", tmp_path, base_model="somewhere") is None
+        with lora.using(model, "policy"):
+            wanted = model(input_ids=tokens, use_cache=False).logits
+        theirs = peft.PeftModel.from_pretrained(tiny_of(kind, **values), str(tmp_path)).eval()
+        got = theirs(input_ids=tokens, use_cache=False).logits
+        merged = theirs.merge_and_unload()(input_ids=tokens, use_cache=False).logits
+    assert (wanted - bare).abs().max() > 0.01
+    torch.testing.assert_close(got, wanted, rtol=0, atol=1e-4)
+    torch.testing.assert_close(merged, wanted, rtol=0, atol=1e-4)
+    assert "every weight has its place" in (tmp_path / "README.md").read_text()
+    other = tiny_of(kind, **values)
+    load_adapter(other, "reward", tmp_path)
+    with torch.no_grad(), lora.using(other, "reward"):
+        torch.testing.assert_close(other(input_ids=tokens, use_cache=False).logits, wanted)
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_where_peft_refuses_an_adapter_the_card_says_so(installed, tmp_path, monkeypatch):
+    if not installed:
+        monkeypatch.setattr(saving.importlib.util, "find_spec", lambda name: None)
+    model = tiny_of("FalconH1", **STATE)
+    lora.add_adapter(model, "policy", 4, 8.0)
+    said = save_adapter(model, "policy", tmp_path, base_model="somewhere")
+    assert said and "no out_proj in models of type falcon_h1" in said
+    card = (tmp_path / "README.md").read_text()
+    assert said in card and "PeftModel" not in card
+
+
+def test_weights_that_peft_would_leave_out_are_found_before_anything_is_promised(tmp_path, monkeypatch):
+    pytest.importorskip("peft")
+    monkeypatch.setattr(saving, "EXPERT_NAMES", ())
+    kind, values = HARD["deepseek3"]
+    model = tiny_of(kind, **values)
+    lora.add_adapter(model, "policy", 4, 8.0)
+    said = save_adapter(model, "policy", tmp_path, base_model="somewhere")
+    assert said and "weights are only here or only there, such as base_model.model.model.layers.0.mlp" in said
+
+
+def test_what_was_not_tried_is_not_called_tried(tmp_path, monkeypatch):
+    monkeypatch.setattr(saving.importlib.util, "find_spec", lambda name: None)
+    model = adapted(tiny_llama, "policy")
+    assert save_adapter(model, "policy", tmp_path, base_model="somewhere") is None
+    card = (tmp_path / "README.md").read_text()
+    assert "was not tried" in card and "every weight has its place" not in card
 
 
 def test_an_adapter_comes_back_from_its_folder(tmp_path):

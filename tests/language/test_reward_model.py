@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from language.tiny import saved, tiny_gpt2, tiny_llama, tokenizer
+from language.tiny import saved, tiny_gpt2, tiny_llama, tiny_of, tokenizer
 
 from tightrope.algorithms.descent import CheckedSteps
 from tightrope.language.data.batching import pad_left, pad_right
@@ -303,6 +303,78 @@ def test_peft_opens_the_adapter_with_its_head(tmp_path, make):
         found = torch.stack([theirs(torch.tensor([text])).logits[0, 0] for text in texts])
     wanted = model.score(*pad_right(texts)) + model.shift
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+HEADLESS = {
+    "granite": ("Granite", {"logits_scaling": 4.0}),
+    "cohere": ("Cohere", {}),
+    "olmoe": ("Olmoe", {"num_experts": 4, "num_experts_per_tok": 2}),
+    "glm4moe": (
+        "Glm4Moe", {"n_routed_experts": 4, "num_experts_per_tok": 2, "moe_intermediate_size": 16,
+                    "n_shared_experts": 1, "first_k_dense_replace": 1, "n_group": 1, "topk_group": 1,
+                    "head_dim": 8},
+    ),
+    "ctrl": ("CTRL", {"n_embd": 16, "dff": 16, "n_layer": 3, "n_head": 2, "n_positions": 96}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("tune", ["lora", "full"])
+@pytest.mark.parametrize("name", HEADLESS)
+@pytest.mark.filterwarnings("ignore:.*is_gradient_checkpointing.*:FutureWarning")  # peft's own
+def test_families_without_a_class_that_scores_get_a_head_of_ours(tmp_path, name, tune):
+    """The bare trunk and its head in a file: read back here, by the card's own lines, and through PEFT."""
+    from transformers import AutoModelForCausalLM
+
+    peft = pytest.importorskip("peft")
+    kind, values = HEADLESS[name]
+    source, rows = saved(tmp_path / "base", tiny_of(kind, **values)), preferences(40)
+    settings = settings_of(source, tune=tune, learning_rate=1e-2, num_epochs=1)
+    told = []
+    train_reward(
+        settings, data=rows, run_dir=tmp_path / "run",
+        listeners=[lambda event: told.append(event) if isinstance(event, Message) else None],
+    )  # fmt: skip
+    assert not [event.text for event in told if event.level == "warning"]
+    model, texts = load_reward(tmp_path / "run"), texts_of(rows)
+    scores = model.score(*pad_right(texts))
+    if tune == "full":  # of the chosen texts of all pairs, most were normalised on
+        assert abs(float(scores.mean())) < 0.2 and abs(float(scores.std(correction=0)) - 1) < 0.2
+    folder = tmp_path / "run" / "model"
+    card = (folder / "README.md").read_text()
+    lines = card.split("```python\n")[1].split("```")[0].replace("this/folder", str(folder))
+    found = {"input_ids": torch.tensor([texts[0]])}
+    with torch.no_grad():
+        exec(lines, found)  # what the card tells others to write
+    torch.testing.assert_close(found["score"].float(), scores[:1], rtol=1e-4, atol=1e-4)
+    if tune == "lora":
+        theirs = peft.PeftModel.from_pretrained(
+            AutoModelForCausalLM.from_pretrained(source), str(tmp_path / "run" / "adapter")
+        ).eval()
+        inner = theirs.get_base_model()
+        with torch.no_grad():
+            hidden = getattr(inner, inner.base_model_prefix)(
+                found["input_ids"], use_cache=False
+            ).last_hidden_state[:, -1]
+        again = (hidden @ model.head.weight.T)[:, 0] - model.shift
+        torch.testing.assert_close(again, scores[:1], rtol=1e-4, atol=1e-4)
+
+
+def test_alignment_reads_a_head_of_ours(tmp_path):
+    """On the policy's trunk where both are adapters, and with a trunk of its own: the same first scores."""
+    from tightrope.language import align
+
+    source = saved(tmp_path / "base", tiny_of("Granite"))
+    settings = settings_of(source, tune="lora", learning_rate=1e-2, num_epochs=1)
+    train_reward(settings, data=preferences(40), run_dir=tmp_path / "reward")
+    found = {}
+    for tune in ("lora", "full"):
+        run = align(
+            model=source, prompts=["say a.", "say b."], reward=str(tmp_path / "reward"), tune=tune, seed=1,
+            total_episodes=4, batch_size=4, minibatch_size=4, max_new_tokens=4, run_dir=tmp_path / tune,
+        )  # fmt: skip
+        rows = [json.loads(line) for line in (run.path / "samples.jsonl").read_text().splitlines()]
+        found[tune] = [row["score"] for row in rows]
+    assert found["lora"] == pytest.approx(found["full"], abs=1e-4) and len(set(found["full"])) == 4
 
 
 def test_the_run_folder_records_what_happened(tmp_path, folder):

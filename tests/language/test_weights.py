@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from language.tiny import VOCABULARY, padded, saved, tiny_gpt2
+from language.tiny import padded, saved, tiny_gpt2, tiny_of
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -21,19 +21,6 @@ from tightrope.language.settings import SFTSettings
 from tightrope.language.supervised.sft import train_sft
 
 State = dict[str, Tensor]
-SIZES = {
-    "vocab_size": VOCABULARY, "hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 3,
-    "num_attention_heads": 2, "num_key_value_heads": 2, "max_position_embeddings": 96,
-    "bos_token_id": 2, "eos_token_id": 3, "pad_token_id": 0,
-}  # fmt: skip
-
-
-def made(kind: str, of: str = "CausalLM", **values):
-    import transformers
-
-    torch.manual_seed(0)
-    config = getattr(transformers, f"{kind}Config")(**SIZES, **values)
-    return getattr(transformers, f"{kind}For{of}")(config).eval()
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +28,11 @@ def models(tmp_path_factory) -> dict[str, str]:
     """Whole folders, by name."""
     folder = tmp_path_factory.mktemp("models")
     own = {
-        "llama": made("Llama"),
-        "tied": made("Llama", tie_word_embeddings=True),
-        "mixtral": made("Mixtral", num_local_experts=4, num_experts_per_tok=2),
+        "llama": tiny_of("Llama"),
+        "tied": tiny_of("Llama", tie_word_embeddings=True),
+        "mixtral": tiny_of("Mixtral", num_local_experts=4, num_experts_per_tok=2),
         "gpt2": tiny_gpt2(),
-        "reward": made("Llama", "SequenceClassification", num_labels=1),
+        "reward": tiny_of("Llama", "SequenceClassification", num_labels=1),
     }
     return {name: saved(folder / name, model) for name, model in own.items()}
 
@@ -187,7 +174,7 @@ def test_the_bias_that_a_class_gives_its_head_is_used(models, monkeypatch):
         self.score.bias = torch.nn.Parameter(torch.tensor([0.5]))
 
     monkeypatch.setattr(Kind, "__init__", with_bias)
-    model = made("Llama", "SequenceClassification", num_labels=1)
+    model = tiny_of("Llama", "SequenceClassification", num_labels=1)
     model.load_state_dict(
         {**load_file(Path(models["reward"], "model.safetensors")), "score.bias": torch.ones(1)}
     )

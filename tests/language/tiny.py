@@ -78,3 +78,17 @@ def padded(rows: int = 4, prompt: int = 6, response: int = 7, seed: int = 0) -> 
         after = int(torch.randint(1, response + 1, (), generator=generator))
         real[row, prompt - before : prompt + after] = True
     return tokens, real, real[:, prompt:]
+
+
+def tiny_of(kind: str, of: str = "CausalLM", **values: Any) -> Any:
+    """A random model of one of transformers' families, by the name in front of ``Config``."""
+    import transformers
+
+    torch.manual_seed(0)
+    sizes = {
+        "vocab_size": VOCABULARY, "hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 3,
+        "num_attention_heads": 2, "num_key_value_heads": 2, "max_position_embeddings": 96,
+        "bos_token_id": 2, "eos_token_id": 3, "pad_token_id": 0, "initializer_range": 0.3,
+    }  # fmt: skip
+    config = getattr(transformers, f"{kind}Config")(**{**sizes, **values})
+    return getattr(transformers, f"AutoModelFor{of}").from_config(config).eval()

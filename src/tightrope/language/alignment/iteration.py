@@ -206,7 +206,7 @@ class Trainer:
     def finish(self, run: Run) -> dict[str, Any]:
         """Write the model; returns the summary."""
         roles, source = self.roles, find_model(self.settings.model)
-        save_model(roles.model, roles.tokenizer, run.path, roles.policy.adapter, source)
+        save_model(roles.model, roles.tokenizer, run.path, roles.policy.adapter, source, self.listeners.warn)
         rows = run.read_metrics()
         if rows and not any("train/minibatches" in row for row in rows):
             self.listeners.warn(

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import copy
+import importlib.metadata
+import importlib.util
 import json
+import re
+import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from tightrope.language.model.architecture import parts
-from tightrope.language.model.load import read_object, read_tensors
+from tightrope.language.model.load import read_object, read_tensors, without_weights
 from tightrope.language.model.lora import (
     Adapted,
     adapter_state,
@@ -22,19 +29,30 @@ from tightrope.runs.durable import atomic_folder, writing
 if TYPE_CHECKING:
     from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
+NUMBER = re.compile(r"\.(\d+)\.")  # the first one in the path of a module is that of its layer
+# Where all experts of a layer are one tensor of this name, PEFT takes the names that their projections had as
+# modules for that tensor, and leaves out modules that still have these names: a shared expert, a dense layer.
+FUSED, EXPERT_NAMES = (
+    (".gate_up_proj", ".down_proj"),
+    ("gate", "gate_proj", "up_proj", "down_proj", "w1", "w2", "w3"),
+)
+# PEFT refuses out_proj in these: their kernels read its weight, past any adapter.
+MAMBAS = ("falcon_h1", "falcon_mamba", "mamba", "mamba2", "nemotron_h")
+
 
 def save_adapter(
     model: PreTrainedModel, name: str, folder: Path, *, base_model: str, score: Tensor | None = None
-) -> None:
-    """Write an adapter as PEFT reads it: adapter_config.json and adapter_model.safetensors. With ``score``,
-    a head [1, d], it is the adapter of a model that scores texts.
+) -> str | None:
+    """Write an adapter as PEFT reads it: adapter_config.json, adapter_model.safetensors, and a card. With
+    ``score``, a head [1, d], it is the adapter of a model that scores texts.
+
+    Returns why PEFT cannot open it, a sentence that the card says too; None where it can.
     """
     from safetensors.torch import save_file
 
     folder.mkdir(parents=True, exist_ok=True)
     modules = [(p, m) for p, m in model.named_modules() if isinstance(m, Adapted) and name in m.down]
     rank = modules[0][1].down[name].shape[0]
-    numbers = {int(word) for path, _ in modules for word in path.split(".") if word.isdigit()}
     config = {
         "peft_type": "LORA",
         "task_type": "CAUSAL_LM" if score is None else "SEQ_CLS",
@@ -44,8 +62,7 @@ def save_adapter(
         "lora_dropout": 0.0,
         "bias": "none",
         "fan_in_fan_out": modules[0][1].transposed,
-        "target_modules": sorted({path.rsplit(".", 1)[-1] for path, _ in modules}),
-        "layers_to_transform": sorted(numbers),
+        **_targets(model, [path for path, _ in modules]),
         "inference_mode": True,
     }
     state = adapter_state(model, name)
@@ -56,6 +73,95 @@ def save_adapter(
     with writing(folder):
         save_file(state, folder / "adapter_model.safetensors", metadata={"format": "pt"})
         (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+        refused = _refused_by_peft(model, state, config)
+        (folder / "README.md").write_text(_card(base_model, refused, score is not None), encoding="utf-8")
+    return refused
+
+
+def _targets(model: PreTrainedModel, paths: list[str]) -> dict[str, Any]:
+    """What adapter_config.json says of the adapted modules, so that PEFT finds these and no others.
+
+    Names of modules and numbers of layers where they mean just these, else whole paths; weights where PEFT
+    would take a name for that of fused experts.
+    """
+    fused = any(name.endswith(FUSED) for name, _ in model.named_parameters())
+    weights = [path for path in paths if fused and path.rsplit(".", 1)[-1] in EXPERT_NAMES]
+    rest = [path for path in paths if path not in weights]
+    leaves, layers = {path.rsplit(".", 1)[-1] for path in rest}, {_layer(path) for path in rest}
+    inner = {id(part) for m in model.modules() if isinstance(m, Adapted) for part in m.children()}
+    every = [path for path, module in model.named_modules() if id(module) not in inner]
+    found = [path for path in every if path.rsplit(".", 1)[-1] in leaves and _layer(path) in layers]
+    config: dict[str, Any] = {"target_modules": rest}
+    if sorted(found) == sorted(rest):
+        config = {"target_modules": sorted(leaves), "layers_to_transform": sorted(layers)}
+    return {**config, "target_parameters": [f"{path}.weight" for path in weights]} if weights else config
+
+
+def _layer(path: str) -> int:
+    """The decoder layer of a module; -1 for one outside of them."""
+    found = NUMBER.search(path)
+    return int(found[1]) if found else -1
+
+
+def _refused_by_peft(model: PreTrainedModel, state: dict[str, Tensor], config: dict[str, Any]) -> str | None:
+    """Why PEFT cannot open an adapter, in a sentence; None where it can. It is tried on a model without
+    weights where PEFT is installed; tightrope does not need it.
+    """
+    reason = None
+    if model.config.model_type in MAMBAS and any(key.endswith(".out_proj.lora_A.weight") for key in state):
+        reason = f"it adapts no out_proj in models of type {model.config.model_type}"
+    elif importlib.util.find_spec("peft") is not None:
+        try:
+            reason = _left_out(model, state, config)
+        except Exception as error:  # PEFT's refusals are of many kinds
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    if reason is None:
+        return None
+    return f"PEFT does not open this adapter ({reason}). The model folder beside it holds the whole model."
+
+
+def _left_out(model: PreTrainedModel, state: dict[str, Tensor], config: dict[str, Any]) -> str | None:
+    """Weights of an adapter that have no place in PEFT's model, or that it lacks; None: each has one."""
+    import peft
+    from transformers import AutoModelForCausalLM, AutoModelForSequenceClassification
+
+    scores = config["task_type"] == "SEQ_CLS"
+    plain = copy.deepcopy(model.config)
+    if scores:
+        plain.num_labels = 1
+    with torch.device("meta"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        bare = without_weights(AutoModelForSequenceClassification if scores else AutoModelForCausalLM, plain)
+        wrapped = peft.PeftModel(
+            bare, peft.LoraConfig(**{k: v for k, v in config.items() if k != "peft_type"})
+        )
+        found: Any = peft.set_peft_model_state_dict(wrapped, {key: x.to("meta") for key, x in state.items()})
+    wrong = [*found.unexpected_keys, *(key for key in found.missing_keys if ".lora_" in key)]
+    return f"{len(wrong)} weights are only here or only there, such as {wrong[0]}" if wrong else None
+
+
+def _card(base_model: str, refused: str | None, scores: bool) -> str:
+    """The card of an adapter: how PEFT opens it, or that it does not."""
+    kind, options = ("SequenceClassification", ", num_labels=1") if scores else ("CausalLM", "")
+    if importlib.util.find_spec("peft") is None:
+        tried = "PEFT was not installed when this was written, so that it was not tried."
+    else:
+        tried = f"Tried with PEFT {importlib.metadata.version('peft')}: every weight has its place."
+    how = f"""```python
+from peft import PeftModel
+from transformers import AutoModelFor{kind}
+
+base = AutoModelFor{kind}.from_pretrained("base/model"{options})
+model = PeftModel.from_pretrained(base, "this/folder")
+```
+
+{tried}"""
+    return f"""# LoRA adapter
+
+Trained on {"/".join(Path(base_model).parts[-2:])}. The model folder beside it has it folded in.
+
+{refused or how}
+"""
 
 
 def load_adapter(model: PreTrainedModel, name: str, folder: Path) -> None:
@@ -64,15 +170,17 @@ def load_adapter(model: PreTrainedModel, name: str, folder: Path) -> None:
     rank, alpha, chosen = config.get("r"), config.get("lora_alpha"), config.get("layers_to_transform")
     state = read_tensors(folder / "adapter_model.safetensors")
     ranks, count = {len(x) for key, x in state.items() if ".lora_A." in key}, len(parts(model).layers)
-    layers = chosen if isinstance(chosen, list) and chosen else list(range(count))
-    inside = all(isinstance(layer, int) and 0 <= layer < count for layer in layers)
+    layers = {_layer(key) for key in state if ".lora_A." in key}
+    inside = layers <= set(range(count)) and (
+        not isinstance(chosen, list) or layers <= {x for x in chosen if isinstance(x, int)}
+    )
     if not (isinstance(rank, int) and {rank} == ranks and isinstance(alpha, int | float) and inside):
         raise ValueError(
             f"{folder / 'adapter_config.json'} has r {rank!r}, lora_alpha {alpha!r}, layers_to_transform "
             f"{chosen!r}; expected the rank {sorted(ranks)} of its weights, a number, and some of the "
             f"model's {count} layers. Was it made for another model?"
         )
-    add_adapter(model, name, rank, float(alpha), tuple(layers))
+    add_adapter(model, name, rank, float(alpha), tuple(sorted(layers)))
     load_adapter_state(model, name, state)
 
 
@@ -82,14 +190,18 @@ def save_model(
     run: Path,
     adapter: str | None,
     base_model: str,
+    notify: Callable[[str], None] = warnings.warn,
 ) -> None:
     """RUN/model for AutoModelForCausalLM.from_pretrained, tokenizer and chat template included. An adapter is
-    folded in, and is also written to RUN/adapter for PEFT; ``base_model`` is the model it belongs to.
+    folded in, and is also written to RUN/adapter for PEFT; ``base_model`` is the model it belongs to. Where
+    PEFT cannot open it, ``notify`` is told.
     """
     write_model(model, tokenizer, run / "model", adapter)
     if adapter is not None:
         with atomic_folder(run / "adapter") as folder:
-            save_adapter(model, adapter, folder, base_model=base_model)
+            refused = save_adapter(model, adapter, folder, base_model=base_model)
+        if refused:
+            notify(f"{run / 'adapter'}: {refused}")
 
 
 def write_model(
