@@ -1,3 +1,3 @@
 """Loading and taking apart causal language models."""
 
-__all__ = ["architecture", "load", "lora", "packaged", "saving", "trunk"]
+__all__ = ["architecture", "load", "lora", "packaged", "saving", "trunk", "weights"]
