@@ -1,10 +1,11 @@
-"""Rewrite the generated tables of docs/control.md: python docs/tables.py
+"""Rewrite the generated tables of docs/: python docs/tables.py
 
 A table is between `<!-- table:NAME -->` and `<!-- end -->`; a test fails if it is out of date.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from tightrope.metrics.table import FAMILIES, of_story
 from tightrope.settings.fields import range_text
 
 PAGE = Path(__file__).with_name("control.md")
+MEASURED = PAGE.parents[1] / "benchmarks/results/language/families.json"
 
 
 def row(*cells: str) -> str:
@@ -70,8 +72,40 @@ def settings() -> list[str]:
     return lines
 
 
+def families() -> list[str]:
+    """The family table, from what benchmarks/families.py measured; refusals are sentences below it."""
+    found = json.loads(MEASURED.read_text(encoding="utf-8"))
+    versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    lines = [
+        f"{found['date']}, {versions}; a cell is the largest difference, at most {found['tolerance']:g}.",
+        "",
+    ]
+    columns = ("doctor", "sft", "reload", "peft", "reward", "align_lora", "align_full")
+    lines += [row("family", *(name.replace("_", " ") for name in columns)), "|---" * (len(columns) + 1) + "|"]
+    reasons: dict[str, list[str]] = {}
+    for kind, cells in found["rows"].items():
+        if "not_built" in cells:
+            reasons.setdefault(f"No tiny model: {cells['not_built']}", []).append(kind)
+            continue
+        lines.append(row(kind, *(_verdict(cells.get(name, {})) for name in columns)))
+        for name in columns:
+            if cells.get(name, {}).get("verdict") == "refused" and not cells[name]["text"].startswith("as "):
+                text = re.sub(r"\S*/", "", cells[name]["text"])
+                text = text.replace(cells["class"], "(class)").replace(f"model type {kind}", "model type")
+                reasons.setdefault(text, []).append(kind)
+    lines += ["", row("said of", "sentence"), "|---|---|"]
+    return lines + [row(", ".join(dict.fromkeys(kinds)), text) for text, kinds in reasons.items()]
+
+
+def _verdict(cell: dict[str, Any]) -> str:
+    if cell.get("verdict") == "ok":
+        return f"{cell['value']:.0e}" if cell["value"] else "ok"
+    return str(cell.get("verdict", ""))
+
+
 TABLES = {"metrics": metrics, "presets": presets, "settings": settings}
 LANGUAGE_TABLES = {"metrics": language_metrics}
+FAMILY_TABLES = {"families": families}
 
 
 def filled(text: str, tables: dict[str, Callable[[], list[str]]] = TABLES) -> str:
@@ -87,6 +121,7 @@ def filled(text: str, tables: dict[str, Callable[[], list[str]]] = TABLES) -> st
 
 
 PAGES = {PAGE: TABLES, PAGE.with_name("rlhf.md"): LANGUAGE_TABLES}
+PAGES[PAGE.with_name("families.md")] = FAMILY_TABLES
 
 if __name__ == "__main__":
     for page, tables in PAGES.items():

@@ -67,6 +67,8 @@ EXCEPTIONS = {
 SHOWN = {
     ("benchmarks/speed_peers.py", "import_module"): "the peers that the benchmark itself names",
     ("benchmarks/packages.py", "import_module"): "the packages that the benchmark itself names",
+    ("benchmarks/families.py", "multiprocessing"): "rows of the benchmark's own processes",
+    ("benchmarks/families.py", "from_pretrained"): "an adapter that the benchmark has just written, in PEFT",
 }
 
 

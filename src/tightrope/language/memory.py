@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.generation.distribution import CHUNK
-from tightrope.language.model.architecture import Parts, parts
+from tightrope.language.model.architecture import Parts, accepted, computes_linear, parts
 from tightrope.language.model.load import fused, pretrained, without_weights
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SupervisedSettings
 from tightrope.training.memory import SHARE, DoesNotFit, available_memory
@@ -341,8 +341,7 @@ def shapes_of(config: PreTrainedConfig, dtype: str) -> Shapes:
     found = parts(model)
     linears = [_linears(layer) for layer in found.layers]
     inner = config.get_text_config()
-    heads = getattr(inner, "num_key_value_heads", None) or inner.num_attention_heads
-    width = getattr(inner, "head_dim", None) or inner.hidden_size // inner.num_attention_heads
+    heads, width = _cache_shape(inner)
     return Shapes(
         parameters=sum(p.numel() for p in model.parameters()),
         base=sum(p.numel() for p in found.base.parameters()),
@@ -355,9 +354,20 @@ def shapes_of(config: PreTrainedConfig, dtype: str) -> Shapes:
     )
 
 
+def _cache_shape(inner: Any) -> tuple[int, int]:
+    """Heads of the KV cache and their width; none where there is no attention: the state of a recurrent layer
+    does not grow with the text.
+    """
+    attention = getattr(inner, "num_attention_heads", None)
+    if not attention:
+        return 0, 0
+    heads = getattr(inner, "num_key_value_heads", None) or attention
+    return heads, getattr(inner, "head_dim", None) or inner.hidden_size // attention
+
+
 def _linears(layer: nn.Module) -> list[tuple[int, int]]:
     """The shapes of the weights that an adapter would change; GPT-2's Conv1D has [in, out]."""
-    kinds = [m for m in layer.modules() if isinstance(m, nn.Linear) or type(m).__name__ == "Conv1D"]
+    kinds = [module for module in layer.modules() if computes_linear(module)]
     weights = [m.get_parameter("weight").shape for m in kinds]
     return [(shape[0], shape[1]) for shape in weights]
 
@@ -391,7 +401,8 @@ def saved_bytes(base: nn.Module, length: int) -> int:
     mask = torch.ones(1, 1, length, length, dtype=torch.bool, device=place).tril()
     tokens = torch.zeros(1, length, dtype=torch.int64, device=place)
     with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(hold, lambda x: x):
-        out = base(input_ids=tokens, attention_mask=mask, use_cache=False).last_hidden_state
+        inputs = accepted(base, input_ids=tokens, attention_mask=mask, use_cache=False)
+        out = base(**inputs).last_hidden_state
     size = sum(x.untyped_storage().nbytes() for x in held.values())
     del out  # until here its graph holds what was saved
     return size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -16,7 +17,7 @@ from tightrope.language.alignment.experience import batch_of, gather, rewards_of
 from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import read_prompts
 from tightrope.language.generation.distribution import Sampling, token_statistics
-from tightrope.language.generation.sample import log_ratio_limit
+from tightrope.language.model import lora
 from tightrope.language.model.load import known_ids, quiet_libraries, unreadable, unwritable
 from tightrope.language.model.weights import WrongWeights
 from tightrope.language.policy.policy_model import Experience, PolicyModel
@@ -83,7 +84,7 @@ def _vocabulary(roles: Roles) -> Finding:
 
 
 def _limit(roles: Roles) -> float:
-    return log_ratio_limit(roles.settings.dtype)
+    return roles.gap_limits.rounding
 
 
 @torch.no_grad()
@@ -189,14 +190,12 @@ def _invariances(roles: Roles, batch: Batch) -> list[Finding]:
 
 
 def _dropout(roles: Roles) -> Finding:
-    tokens = torch.arange(8)[None] % roles.model.config.vocab_size
-    tokens = tokens.to(next(roles.model.parameters()).device)
-    real = torch.ones_like(tokens, dtype=torch.bool)
-    was = roles.model.training
-    roles.model.train()
-    with torch.no_grad():
-        same = torch.equal(roles.trunk.hidden(tokens, real), roles.trunk.hidden(tokens, real))
-    roles.model.train(was)
+    """In the mode in which activations are checkpointed, where the model has it; no other is trained in."""
+    with contextlib.suppress(ValueError):
+        lora.checkpoint_activations(roles.model)
+    lora.training_mode(roles.model, True)
+    same = lora.repeats(roles.model)
+    lora.training_mode(roles.model, False)
     return Finding(
         "dropout is off, also in training mode", same,
         "two passes are equal" if same else "two passes differ",

@@ -171,6 +171,13 @@ LANGUAGE_TABLE = (
         "Response tokens of this update over the seconds of sampling them.",
     ),
     metric("sft/loss", "nats/token", "down", "-logp of the tokens to be learnt, mean over the minibatch."),
+    metric(
+        "sft/router_loss",
+        "1",
+        "down",
+        "Router auxiliary loss of a mixture of experts, before its coefficient; part of sft/loss where "
+        "config.json asks for it (output_router_logits). At its least where experts are used evenly.",
+    ),
     metric("sft/held_out_loss", "nats/token", "down", "The same on examples that are not trained on."),
     metric("sft/learning_rate", "1", "any", "Adam's step size in this update.", high=1e-2),
     metric("sft/grad_norm", "1", "any", "Norm of all gradients together, before it is limited."),

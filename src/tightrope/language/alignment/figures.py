@@ -5,6 +5,7 @@ finite, and probabilities that are not those of sampling.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from tightrope.algorithms.descent import SamplingMismatch
 from tightrope.algorithms.nonfinite import NonFiniteError, first_bad
+from tightrope.language.generation.sample import GapLimits
 from tightrope.language.policy.policy_model import Experience
 from tightrope.language.policy.roles import Roles
 from tightrope.language.reward.functions import Scores
@@ -101,17 +103,41 @@ def refuse_bad_numbers(experience: Experience, roles: Roles) -> None:
     )
 
 
-def refuse_mismatch(gap: float, limit: float, dtype: str, *, first: bool) -> None:
-    """SamplingMismatch when log-probabilities of sampling and of the pass that trains differ by more than
-    rounding can explain (``limit``, in nats). ``first``: nothing was learned yet.
+def warn_of_mismatch(
+    metrics: dict[str, float],
+    roles: Roles,
+    warned: set[tuple[str, str]],
+    warn: Callable[[str], None],
+    *,
+    first: bool,
+) -> None:
+    """`check_mismatch` of a rollout; its warning is given once a run, and is then in ``warned``."""
+    gap = metrics["objective/sampling_gap"]
+    words = check_mismatch(gap, roles.gap_limits, roles.settings.dtype, first=first)
+    if words is not None and ("sampling", "gap") not in warned:
+        warned.add(("sampling", "gap"))
+        warn(words)
+
+
+def check_mismatch(gap: float, limits: GapLimits, dtype: str, *, first: bool) -> str | None:
+    """Whether log-probabilities of sampling and of the pass that trains differ by more than rounding
+    explains: None, or words for a warning. ``gap`` in nats; ``first``: nothing was learned yet.
+
+    SamplingMismatch where the gap is above what ends a run.
     """
     # the tail of rounding errors grows with the tokens of a run: in bfloat16 only the beginning is checked
     checked = dtype == "float32" or first or not math.isfinite(gap)
-    if checked and not gap <= limit:
-        raise SamplingMismatch(
-            f"The log-probabilities of sampling and of the forward pass that trains differ by {gap:.3g} "
-            f"nats (limit {limit:g} in {dtype}). Likely causes: the model computes other numbers with its KV "
-            "cache, layers that look back over a window or were shared wrongly, a module that "
-            "draws random numbers, or too coarse a precision. See tightrope doctor --model, and try --dtype "
-            "float32, or lora_layers left out."
-        )
+    if not checked or gap <= limits.rounding:
+        return None
+    seen = (
+        f"The log-probabilities of sampling and of the forward pass that trains differ by {gap:.3g} nats, "
+        f"more than rounding explains in {dtype} in a model of this size ({limits.rounding:.2g})"
+    )
+    if gap <= limits.stop:
+        return f"{seen}. The run ends above {limits.stop:.2g}. See tightrope doctor --model."
+    raise SamplingMismatch(
+        f"{seen}, and above the limit {limits.stop:.2g}. Likely causes: the model computes other numbers "
+        "with its KV cache, layers that look back over a window or were shared wrongly, a module that draws "
+        "random numbers, or too coarse a precision. See tightrope doctor --model, and try --dtype float32, "
+        "or lora_layers left out."
+    )

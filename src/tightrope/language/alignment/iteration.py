@@ -25,13 +25,12 @@ from tightrope.language.alignment.experience import (
     rewards_of,
     to_scale,
 )
-from tightrope.language.alignment.figures import refuse_bad_numbers, refuse_mismatch, rollout_metrics
+from tightrope.language.alignment.figures import refuse_bad_numbers, rollout_metrics, warn_of_mismatch
 from tightrope.language.alignment.kl import adapted, kl_loss, shared_scale
 from tightrope.language.alignment.monitor import Monitor
 from tightrope.language.alignment.ptx import Pretraining
 from tightrope.language.alignment.samples import sample_rows
 from tightrope.language.data.examples import Prompt, Rows, hold_out_prompts, read_prompts, read_rows
-from tightrope.language.generation.sample import log_ratio_limit
 from tightrope.language.model.architecture import context_length
 from tightrope.language.model.load import known_ids
 from tightrope.language.model.packaged import find_model
@@ -123,6 +122,7 @@ class Trainer:
             warn=listeners.warn,
             own_reward=on_trunk is None and folder_of(reward) is not None,
         )
+        self.roles.trunk.require_padding_unread()
         self.prompts = self._read_prompts(prompts)
         self.judge = make_judge(reward, self.roles, on_trunk=on_trunk, timeout=settings.reward_timeout)
         self.held_out: list[Prompt] = []
@@ -146,7 +146,6 @@ class Trainer:
             Pretraining.make(settings, self.roles, listeners.warn) if settings.ptx_weight else None
         )
         self.monitor = Monitor(kl_budget=settings.kl_budget)
-        self.log_ratio_limit = log_ratio_limit(settings.dtype)
         self.episodes, self.iteration, self.stopped = 0, 0, False
         self.seconds, self.rollbacks, self.newest = 0.0, 0, dict[str, float]()
         self.changes: dict[str, Any] = {}
@@ -400,8 +399,7 @@ class Trainer:
         batch = batch_of(experience, found.rewards, valid, settings, self.return_scale)
         plain = found.rewards / found.scale  # the metrics are those before whiten_rewards
         metrics = rollout_metrics(experience, scores, plain, found.kl_share, valid) | scores.metrics | gold
-        gap = metrics["objective/sampling_gap"]
-        refuse_mismatch(gap, self.log_ratio_limit, settings.dtype, first=not self.iteration)
+        warn_of_mismatch(metrics, self.roles, self._warned, self.listeners.warn, first=not self.iteration)
         self._watch(metrics)
         times = {"pause": begin - pause, "seconds": scored - begin, "score_seconds": scored - gathered}
         return Taken(asked, experience, scores, valid, batch, found.scale, metrics, **times)
@@ -431,7 +429,7 @@ class Trainer:
             self.update_rng,
             extra_loss=extra,
             draw=None if extra is None or self.pretraining is None else self.pretraining.draw,
-            log_ratio_limit=self.log_ratio_limit,
+            log_ratio_limit=self.roles.gap_limits.stop,
         )
         if "train/micro_batch_size" in metrics:
             self._smaller(int(metrics["train/micro_batch_size"]))

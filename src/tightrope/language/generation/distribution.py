@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.architecture import FACTOR
+from tightrope.language.model.architecture import CAP, FACTOR
 
 CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 
@@ -23,12 +23,13 @@ CHUNK = 1 << 23  # logits at a time: 34 MB in float32
 @dataclass(frozen=True)
 class Sampling:
     """How tokens are drawn: temperature, only the k likeliest (0, or more than there are: all), tokens that
-    are never drawn.
+    are never drawn. ``cap``: logits x of the head become cap tanh(x / cap) first, as the model does.
     """
 
     temperature: float = 1.0
     top_k: int = 0
     forbidden: tuple[int, ...] = ()
+    cap: float | None = None
 
     def choices(self, size: int) -> int:
         """How many of ``size`` ids top-k chooses among."""
@@ -45,11 +46,13 @@ def shape_logits(
 ) -> Tensor:
     """Logits [N, V] of the head -> logits of the distribution in float32, [N, V], or [N, k] on a support.
 
-    Divides by the temperature and forbids what must not be drawn. ``support`` [N, k]: the ids that top-k left
-    when the token was sampled; the others have probability 0 for every role. ``in_place``: float32 logits
-    may be written over.
+    Caps them, divides by the temperature and forbids what must not be drawn. ``support`` [N, k]: the ids
+    that top-k left when the token was sampled; the others have probability 0 for every role. ``in_place``:
+    float32 logits may be written over.
     """
     shaped = logits.float() if in_place else logits.to(torch.float32, copy=True)
+    if sampling.cap is not None:
+        shaped.div_(sampling.cap).tanh_().mul_(sampling.cap)
     if sampling.temperature != 1.0:
         shaped.div_(sampling.temperature)
     if sampling.forbidden:
@@ -58,11 +61,15 @@ def shape_logits(
 
 
 def at_head(sampling: Sampling, head: nn.Linear) -> Sampling:
-    """``sampling`` corrected for the factor between the head's output and the model's logits."""
+    """``sampling`` corrected for the factor and the cap between the head's output and the model's logits:
+    cap tanh(factor x / cap) / T = c tanh(x / c) / (T / factor) with c = cap / factor.
+    """
     factor: float = getattr(head, FACTOR, 1.0)
-    if factor == 1.0:
+    cap: float | None = getattr(head, CAP, None)
+    if factor == 1.0 and cap is None:
         return sampling
-    return dataclasses.replace(sampling, temperature=sampling.temperature / factor)
+    bend = None if cap is None else cap / factor
+    return dataclasses.replace(sampling, temperature=sampling.temperature / factor, cap=bend)
 
 
 def next_logits(hidden: Tensor, head: nn.Linear, sampling: Sampling) -> Tensor:
@@ -218,7 +225,11 @@ class _Chunks:
         return self.to_head(p.mul_(inner).scatter_add_(1, chosen, to_logp), rows)
 
     def to_head(self, gradient: Tensor, rows: slice) -> Tensor:
-        """A gradient of shaped logits, written over, as one of the head's own logits [n, V]."""
+        """A gradient of shaped logits, written over, as one of the head's own logits [n, V]; comes after
+        `policy` of these rows.
+        """
+        if self.sampling.cap is not None:
+            gradient *= self._buffers["slope"][: len(gradient)]
         if self.sampling.temperature != 1.0:
             gradient /= self.sampling.temperature
         if self.support is not None:
@@ -235,6 +246,11 @@ class _Chunks:
         if bias is not None:
             logits += bias
         logs = shape_logits(logits, self.sampling, allowed, in_place=True)
+        if self.sampling.cap is not None and name == "p":
+            slope = self._buffer("slope", len(logs), logs.shape[1], logs.dtype)
+            # d/dx of cap tanh(x / cap); a forbidden token is at -inf and has none
+            torch.mul(logs, self.sampling.temperature / self.sampling.cap, out=slope)
+            slope.square_().neg_().add_(1.0).clamp_(min=0.0)
         logs -= logs.amax(1, keepdim=True)
         p = torch.exp(logs, out=self._buffer(name, len(logs), logs.shape[1], logs.dtype))
         total = p.sum(1, keepdim=True)

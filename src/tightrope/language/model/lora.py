@@ -10,6 +10,7 @@ off, and a backward pass that comes later drops their gradients silently).
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -17,10 +18,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from tightrope.language.model.architecture import parts
+from tightrope.language.model.architecture import accepted, computes_linear, parts
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel
+
+
+ROUNDING = 1e-5  # relative; two equal passes, whose sums a GPU may add up in another order
 
 
 class Switch:
@@ -34,7 +38,11 @@ class Switch:
 
 
 class Adapted(nn.Module):
-    """A linear layer of the trunk with its adapters; the layer itself is ``base``, frozen."""
+    """A linear layer of the trunk with its adapters; the layer itself is ``base``, frozen.
+
+    Some models read a layer's weight instead of calling it (Jamba's dt_proj): ``weight`` is then the one that
+    is on, adapter included. Everything else that a layer is asked for is its base's.
+    """
 
     def __init__(self, base: nn.Module, switch: Switch) -> None:
         super().__init__()
@@ -42,6 +50,22 @@ class Adapted(nn.Module):
         self.down, self.up = nn.ParameterDict(), nn.ParameterDict()
         self._scale: dict[str, float] = {}
         self._folded: dict[str, Tensor] = {}
+
+    @property
+    def weight(self) -> Tensor:
+        """The weight of the adapter that is on, differentiable in it."""
+        name = self._switch.active
+        if name is None or name not in self.down:
+            return self.base.weight  # type: ignore[return-value]
+        return self.merged(name)
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            if name == "base":
+                raise
+            return getattr(self.base, name)
 
     @property
     def transposed(self) -> bool:
@@ -96,10 +120,6 @@ class Adapted(nn.Module):
         return torch.addmm(weight.float(), first, second, alpha=self._scale[name]).to(weight.dtype)
 
 
-def _is_linear(module: nn.Module) -> bool:
-    return isinstance(module, nn.Linear) or type(module).__name__ == "Conv1D"  # transformers' own, in GPT-2
-
-
 def top_layers(model: PreTrainedModel, count: int | None) -> tuple[int, ...]:
     """Indices of the ``count`` topmost decoder layers (None: all). ValueError: the model has fewer."""
     total = len(parts(model).layers)
@@ -131,7 +151,7 @@ def add_adapter(
                 owner.add(name, rank, alpha, generator)
                 continue
             for child, module in list(owner.named_children()):
-                if _is_linear(module) and child != "base":
+                if computes_linear(module) and child != "base":
                     adapted = Adapted(module, switch)
                     adapted.add(name, rank, alpha, generator)
                     setattr(owner, child, adapted)
@@ -178,9 +198,8 @@ def folded(model: PreTrainedModel, name: str | None) -> Iterator[None]:
 
 
 def checkpoint_activations(model: PreTrainedModel) -> None:
-    """Compute activations again in the backward pass, with the adapter that was on in the forward pass.
-
-    transformers does so only in training mode; dropout is 0 everywhere.
+    """Compute activations again in the backward pass, with the adapter that was on in the forward pass, where
+    `training_mode` is on. ValueError for an architecture that cannot.
     """
     enable = getattr(model, "activation_checkpointing_enable", None) or model.gradient_checkpointing_enable
 
@@ -188,7 +207,58 @@ def checkpoint_activations(model: PreTrainedModel) -> None:
         switch = getattr(model, "adapter_switch", None)
         return contextlib.nullcontext(), using(model, None if switch is None else switch.active)
 
-    enable({"use_reentrant": False, "context_fn": contexts})
+    try:
+        enable({"use_reentrant": False, "context_fn": contexts})
+    except ValueError as error:
+        raise ValueError(
+            f"{type(model).__name__} cannot compute activations again in the backward pass ({error}). Leave "
+            "--gradient-checkpointing out."
+        ) from error
+    for layer in _checkpointed(model):
+        config: Any = getattr(layer, "config", None)
+        random = [
+            name for name, x in vars(config or object).items() if isinstance(x, float) and "drop" in name
+        ]
+        if any(getattr(config, name) for name in random):
+            layer.config = copy.copy(config)  # a layer of Falcon reads its dropout there
+            for name in random:
+                setattr(layer.config, name, 0.0)
+
+
+def training_mode(model: PreTrainedModel, on: bool) -> None:
+    """transformers checkpoints activations only in training mode. Only the modules that do so are put into
+    it: whatever else reads the mode, such as dropout, layer dropping or the noise of a router, stays as it is
+    in evaluation.
+    """
+    for layer in _checkpointed(model):
+        layer.training = on
+
+
+def _checkpointed(model: nn.Module) -> list[Any]:
+    """The modules whose activations are checkpointed: decoder layers, or else whole stacks of them."""
+    found = [module for module in model.modules() if getattr(module, "gradient_checkpointing", False)]
+    return [module for module in found if not hasattr(module, "config_class")] or found
+
+
+@torch.no_grad()
+def require_repeatable(model: PreTrainedModel) -> None:
+    """ValueError unless two forward passes in the present mode are equal: nothing draws random numbers."""
+    if not repeats(model):
+        raise ValueError(
+            f"Two forward passes of {type(model).__name__} (model type {model.config.model_type}) over the "
+            "same tokens differ: a module draws random numbers (dropout of a kind that is not known here). "
+            "Set it to 0 in config.json, or leave --gradient-checkpointing out."
+        )
+
+
+@torch.no_grad()
+def repeats(model: PreTrainedModel) -> bool:
+    """Whether two forward passes over a few tokens are equal up to the rounding of parallel sums."""
+    base, _, head = parts(model)
+    tokens = torch.arange(8, device=head.weight.device)[None] % head.out_features
+    inputs = accepted(base, input_ids=tokens, use_cache=False)
+    one, two = (base(**inputs).last_hidden_state.float() for _ in range(2))
+    return bool((one - two).abs().max() <= ROUNDING * one.abs().max())
 
 
 def adapter_parameters(model: nn.Module, name: str) -> list[nn.Parameter]:

@@ -17,14 +17,16 @@ from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
 from tightrope.language.model import lora
-from tightrope.language.model.architecture import WINDOW_FIELDS, parts
+from tightrope.language.model.architecture import WINDOW_FIELDS, accepted, parts
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel
 
 FINAL_NORMS = ("norm", "ln_f", "final_layer_norm")
 NARROW = 3  # tokens of a window while the halves are tried
-HALVES_TOLERANCE = 1e-4  # relative; the two halves are the same operations in the same order
+# relative, in bfloat16 and in float32; the two halves are the same operations in the same order
+HALVES_TOLERANCE = 0.05, 1e-4
+PADDING_TOLERANCE = 0.1, 1e-2  # relative; a layer that reads padding changes the states by their own size
 
 
 class Trunk:
@@ -40,9 +42,11 @@ class Trunk:
         self._checkpointing = checkpointing
         if checkpointing:
             lora.checkpoint_activations(model)
+            lora.training_mode(model, True)
+            lora.require_repeatable(model)
+            lora.training_mode(model, False)
         if cut > 0 and any(child is self.parts.layers for child in self.parts.base.children()):
-            self._lower, self._upper = _halves(self.parts.base, self.parts.layers, cut)
-            self.cut = cut if self._agrees(cut) else 0
+            self._cut_in_two(cut)
 
     def lower(self, tokens: Tensor, real: Tensor) -> Tensor | None:
         """Hidden states [B, T, d] that enter the upper part; None when the trunk is in one piece."""
@@ -54,35 +58,58 @@ class Trunk:
     def hidden(self, tokens: Tensor, real: Tensor, lower: Tensor | None = None) -> Tensor:
         """Hidden states [B, T, d] after the final norm; ``lower`` saves the lower part of a trunk in two."""
         if self._checkpointing and torch.is_grad_enabled():
-            self.model.train()  # transformers checkpoints only in this mode, and caches only in the other
+            lora.training_mode(self.model, True)  # caches are kept only in the other
         try:
             if lower is None or not self.cut:
                 return _run(self.parts.base, real, input_ids=tokens)
             return _run(self._upper, real, inputs_embeds=lower)
         finally:
             if self._checkpointing:
-                self.model.eval()
+                lora.training_mode(self.model, False)
 
     @torch.no_grad()
-    def _agrees(self, cut: int) -> bool:
-        """Whether two halves give the same as the whole, on a padded batch of this model.
+    def _cut_in_two(self, cut: int) -> None:
+        """Make the two halves and use them where they give the same as the whole, on a padded batch.
 
         Attention windows are narrowed meanwhile, so that a few tokens show a layer with a wrong window.
         """
-        device = next(self.model.parameters()).device
-        tokens = torch.arange(24, device=device).reshape(2, 12) % self.model.config.vocab_size
-        real = torch.ones(2, 12, dtype=torch.bool, device=device)
-        real[0, :2], real[1, 11:] = False, False
+        tokens, real = self._few_tokens()
         base, layers = self.parts.base, self.parts.layers
         try:
             with _narrow_windows(base.config):
                 lower, upper = _halves(base, layers, cut)
                 whole = _run(base, real, input_ids=tokens)
                 both = _run(upper, real, inputs_embeds=_run(lower, real, input_ids=tokens))
+            self._lower, self._upper = _halves(base, layers, cut)
         except (TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError):
-            return False  # the layers of this architecture need more than the output of the layer before
-        gap = (whole - both)[real].abs().max() / whole[real].abs().max()
-        return bool(gap <= (HALVES_TOLERANCE if whole.dtype == torch.float32 else 0.05))
+            return  # the layers of this architecture need more than the output of the layer before
+        if relative_gap(both[real], whole[real]) <= HALVES_TOLERANCE[whole.dtype == torch.float32]:
+            self.cut = cut
+
+    def _few_tokens(self) -> tuple[Tensor, Tensor]:
+        """Two rows [2, 12], one padded on the left, one on the right, and their mask."""
+        device = next(self.model.parameters()).device
+        tokens = torch.arange(24, device=device).reshape(2, 12) % self.parts.head.out_features
+        real = torch.ones(2, 12, dtype=torch.bool, device=device)
+        real[0, :2], real[1, 11:] = False, False
+        return tokens, real
+
+    @torch.no_grad()
+    def require_padding_unread(self) -> None:
+        """ValueError for a model whose hidden states depend on the padding of a row: on how much there is, or
+        on its ids. Prompts are padded on the left.
+        """
+        tokens, real = self._few_tokens()
+        apart = _run(self.parts.base, real[:1, 2:], input_ids=tokens[:1, 2:])
+        beside = _run(self.parts.base, real, input_ids=torch.where(real, tokens, 1))[:1, 2:]
+        gap = relative_gap(beside, apart)
+        if not gap <= PADDING_TOLERANCE[apart.dtype == torch.float32]:
+            raise ValueError(
+                f"{type(self.model).__name__} (model type {self.model.config.model_type}) computes other "
+                f"hidden states for a text that is padded on the left (relative difference {gap:.1e}): its "
+                "attention mask or positions are not respected, so that what is sampled would depend on the "
+                "other prompts of a batch. Use it with sft only, or choose another model."
+            )
 
 
 @dataclass(frozen=True)
@@ -104,11 +131,15 @@ class Role:
             switch.active = before
 
 
+def relative_gap(x: Tensor, y: Tensor) -> float:
+    """max |x - y| as a share of max |y|."""
+    return float((x - y).abs().max() / y.abs().max())
+
+
 def _run(base: nn.Module, real: Tensor, **inputs: Tensor) -> Tensor:
     mask = None if bool(real.all()) else real.long()
-    return base(
-        attention_mask=mask, position_ids=positions(real), use_cache=False, **inputs
-    ).last_hidden_state
+    options = accepted(base, attention_mask=mask, position_ids=positions(real), use_cache=False)
+    return base(**inputs, **options).last_hidden_state
 
 
 def _halves(base: nn.Module, layers: nn.ModuleList, cut: int) -> tuple[nn.Module, nn.Module]:

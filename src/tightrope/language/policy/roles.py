@@ -20,6 +20,7 @@ import torch
 from torch import nn
 
 from tightrope.language.generation.distribution import Sampling, token_statistics
+from tightrope.language.generation.sample import GapLimits, cache_works, gap_limits
 from tightrope.language.memory import job_of, require_memory, reward_model_bytes
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import parameter_counts, parts
@@ -78,6 +79,12 @@ class Roles:
         """The policy's model."""
         return self.policy.trunk.model
 
+    @property
+    def gap_limits(self) -> GapLimits:
+        """How far sampling and training may be apart in this model."""
+        layers, head = self.trunk.parts.layers, self.trunk.parts.head
+        return gap_limits(self.settings.dtype, len(layers), head.in_features)
+
     def frozen_policy(self) -> contextlib.AbstractContextManager[None]:
         """Inside, the model is the policy as it is now, its adapter folded in; without gradients."""
         return lora.folded(self.model, self.policy.adapter)
@@ -109,7 +116,7 @@ class Roles:
             else ""
         )
         never = len(unwritable(self.model, self.tokenizer))
-        return [
+        lines = [
             f"policy: {settings.model}, {settings.tune}, {trained:,} of {total:,} parameters trained{shared}",
             *(
                 [f"{never} of the model's ids are never sampled: the tokenizer does not have them"]
@@ -118,6 +125,12 @@ class Roles:
             ),
             f"critic: {settings.critic}; KL: {settings.kl}, kl_beta {settings.kl_beta:g}",
         ]
+        if not cache_works(trunk.parts.base, trunk.parts.head.out_features):
+            lines.append(
+                "cache: this model keeps none that gives the same numbers, so that every token computes the "
+                "whole text again"
+            )
+        return lines
 
     def parameters(self) -> list[nn.Parameter]:
         """Everything that is trained: the policy's weights or adapter, then the critic's."""
@@ -172,7 +185,7 @@ def make_roles(
         critic = Role(Trunk(again().to(device), checkpointing=checkpointing))
     head = None
     if settings.critic != "none":
-        head = nn.Linear(model.config.hidden_size, 1).to(device)
+        head = nn.Linear(parts(model).head.in_features, 1).to(device)
         nn.init.zeros_(head.weight)  # the first values are 0 for any hidden state
         nn.init.zeros_(head.bias)
     never = never_drawn(model, tokenizer, stops, ignore_eos=settings.ignore_eos)

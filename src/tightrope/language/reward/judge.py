@@ -224,7 +224,7 @@ def make_judge(reward: RewardSources, roles: Roles, *, on_trunk: Path | None, ti
                 raise ValueError("Two reward models were given; expected one, and any number of functions.")
             model_weight = entry.weight
             if on_trunk is not None and entry.folder / "adapter" == on_trunk:
-                weight, shift = read_head(on_trunk / HEAD, roles.model.config.get_text_config().hidden_size)
+                weight, shift = read_head(on_trunk / HEAD, roles.trunk.parts.head.in_features)
                 adapter = weight.to(roles.settings.device), shift
             else:
                 model = load_reward(entry.folder).to(roles.settings.device)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
+from tightrope.language.model.architecture import accepted
 from tightrope.language.model.load import (
     fused,
     load_tokenizer,
@@ -54,10 +55,10 @@ class RewardModel:
         """Scores [B] before the shift, differentiable. ``right``: all padding follows the text, where
         causal attention never looks, and no mask is needed.
         """
-        mask: dict[str, Tensor] = {}
+        inputs: dict[str, Any] = {"input_ids": tokens, "use_cache": False}
         if not right and not bool(real.all()):
-            mask = {"attention_mask": real.long(), "position_ids": positions(real)}
-        hidden = self.base(input_ids=tokens, use_cache=False, **mask).last_hidden_state
+            inputs |= {"attention_mask": real.long(), "position_ids": positions(real)}
+        hidden = self.base(**accepted(self.base, **inputs)).last_hidden_state
         with torch.autocast(hidden.device.type, enabled=False):
             return self.head(last_real(hidden, real).to(self.head.weight.dtype))[:, 0]
 

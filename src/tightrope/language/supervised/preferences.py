@@ -146,8 +146,9 @@ def resume_reward(
 def _objective(
     settings: RewardSettings, loaded: Loaded, given: Mapping[str, Rows | None], listeners: Listeners
 ) -> Objective:
-    base, size = parts(loaded.model).base, settings.micro_batch_size or settings.minibatch_size
-    head = make_head(loaded.model.config.get_text_config().hidden_size, settings.seed).to(settings.device)
+    base, _, language_head = parts(loaded.model)
+    size = settings.micro_batch_size or settings.minibatch_size
+    head = make_head(language_head.in_features, settings.seed).to(settings.device)
     model, skeleton = RewardModel(base, head, 0.0, loaded.tokenizer), reward_skeleton(loaded)
     pairs, held, texts = _data(settings, loaded, given, listeners)
 

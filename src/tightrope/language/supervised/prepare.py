@@ -109,11 +109,12 @@ def load_for_training(
             f"max_tokens is {settings.max_tokens}, but {settings.model} reads {limit} tokens. Choose "
             f"max_tokens {limit} or less."
         )
-    without_dropout(model.to(settings.device))
+    without_dropout(model.to(settings.device).eval())
     eos = sorted(eos_ids(model, tokenizer), key=lambda token: token != tokenizer.eos_token_id)
     if settings.gradient_checkpointing:
         lora.checkpoint_activations(model)
-        model.train()  # transformers checkpoints only in training mode; dropout is 0 everywhere
+        lora.training_mode(model, True)
+    lora.require_repeatable(model)
     if settings.tune == "full":
         return Loaded(model.requires_grad_(True), tokenizer, source, tuple(eos), None)
     layers = lora.top_layers(model, settings.lora_layers)

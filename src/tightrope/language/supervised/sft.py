@@ -5,17 +5,25 @@ L = - sum over learnt tokens of log p(token | the tokens before it) / their numb
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from tightrope.language.data.batching import Example, Packed, attention_of, collate, pack_rows, row_of
+from tightrope.language.data.batching import (
+    PADDING,
+    Example,
+    Packed,
+    attention_of,
+    collate,
+    pack_rows,
+    row_of,
+)
 from tightrope.language.data.examples import Row, Rows, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
-from tightrope.language.model.architecture import attention_window, parts
+from tightrope.language.model.architecture import accepted, attention_window, parts
 from tightrope.language.model.load import known_ids
 from tightrope.language.model.saving import save_model
 from tightrope.language.settings import SFTSettings
@@ -26,7 +34,8 @@ from tightrope.training.events import Listener, Listeners
 if TYPE_CHECKING:
     from transformers import PreTrainedModel
 
-PACKED_GAP = 1e-4  # relative, float32: a row of two texts sums in another order
+PACKED_GAP = 0.05, 1e-3  # relative, in bfloat16 and in float32: a row of two texts sums in another order
+LOOKING_BACK = (TypeError, ValueError, RuntimeError, AttributeError, IndexError, KeyError)
 
 
 def hidden_states(model: PreTrainedModel, rows: Packed) -> Tensor:
@@ -34,19 +43,22 @@ def hidden_states(model: PreTrainedModel, rows: Packed) -> Tensor:
     base = parts(model).base
     if not bool((rows.segments > 0).any()):
         # One text a row: the padding follows it, and causal attention never looks ahead.
-        return base(input_ids=rows.tokens, use_cache=False).last_hidden_state
+        return base(**accepted(base, input_ids=rows.tokens, use_cache=False)).last_hidden_state
     allowed = attention_of(rows.segments)
     # Added to the scores by every implementation of attention; some would add a boolean mask as 0 and 1.
     mask = torch.zeros(allowed.shape, dtype=model.dtype, device=allowed.device)
     mask.masked_fill_(~allowed, torch.finfo(model.dtype).min)
-    out = base(input_ids=rows.tokens, attention_mask=mask, position_ids=rows.positions, use_cache=False)
-    return out.last_hidden_state
+    options = accepted(base, attention_mask=mask, position_ids=rows.positions, use_cache=False)
+    return base(input_ids=rows.tokens, **options).last_hidden_state
 
 
-@torch.no_grad()
 def require_packable(model: PreTrainedModel, longest: int) -> None:
     """ValueError for a model whose loss would not be the same when texts share a row of ``longest`` tokens:
-    its attention has a shorter window, or it reads attention masks differently.
+    its attention has a shorter window, a layer carries a state from one text to the next, or positions and
+    masks are read differently.
+
+    A text must not depend on the one before it: the gradient of its hidden states in the embeddings of that
+    one is exactly 0, in every precision, where masked attention is all that connects them.
     """
     name, window = type(model).__name__, attention_window(model)
     if window is not None and window < longest:
@@ -56,25 +68,115 @@ def require_packable(model: PreTrainedModel, longest: int) -> None:
             f"{window} or less."
         )
     texts = [Example(tuple(range(size)), (False, *(True,) * (size - 1))) for size in (5, 4)]
-    apart = token_loss(model, collate([row_of([text]) for text in texts]).to(model.device))
-    gap, reason = float("inf"), ""
+    rows = [row_of(part).to(model.device) for part in ([texts[0]], [texts[1]], texts)]
     try:
-        gap = float((token_loss(model, row_of(texts).to(model.device)) / apart - 1).abs())
-    except (TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
-        reason = f" ({error})"
-    if gap > (PACKED_GAP if model.dtype == torch.float32 else 0.05):
+        with torch.no_grad():
+            apart = torch.cat([hidden_states(model, row) for row in rows[:2]], 1).float()
+        leak, together = _leak(model, rows[2], len(texts[0].tokens))
+    except LOOKING_BACK as error:
         raise ValueError(
-            f"--pack with {name}: two texts in one row give another loss than apart, relative gap {gap:.1e}"
-            f"{reason}. The model reads attention masks in another way. Leave --pack out."
+            f"--pack with {name}: a row of two texts cannot be computed ({error}). Leave --pack out."
+        ) from error
+    gap = float((together.float() - apart).abs().max() / apart.abs().max())
+    if leak or not gap <= PACKED_GAP[together.dtype == torch.float32]:
+        seen = (
+            f"the second of two texts in a row depends on the first ({leak:.1e})"
+            if leak
+            else (f"two texts in one row give other hidden states than apart, relative gap {gap:.1e}")
         )
+        raise ValueError(
+            f"--pack with {name}: {seen}. A recurrent or convolutional layer carries its state on, or the "
+            "model reads attention masks or positions in another way. Leave --pack out."
+        )
+
+
+def _leak(model: PreTrainedModel, row: Packed, first: int) -> tuple[float, Tensor]:
+    """The largest gradient of what follows the first text in the embeddings of its ``first`` tokens, and the
+    hidden states [1, N, d].
+    """
+    embedded: list[Tensor] = []
+
+    def follow(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
+        embedded.append(output.detach().requires_grad_())
+        return embedded[-1]
+
+    handle = model.get_input_embeddings().register_forward_hook(follow)
+    try:
+        with torch.enable_grad():
+            hidden = hidden_states(model, row)
+            (slope,) = torch.autograd.grad(hidden[:, first:].float().square().sum(), embedded[0])
+    finally:
+        handle.remove()
+    return float(slope[:, :first].abs().max()), hidden.detach()
 
 
 def token_loss(model: PreTrainedModel, rows: Packed) -> Tensor:
     """-log p summed over the learnt tokens, a scalar in nats; divide by ``rows.learn.sum()`` for the mean."""
+    return _loss_of(model, hidden_states(model, rows), rows)
+
+
+def _loss_of(model: PreTrainedModel, hidden: Tensor, rows: Packed) -> Tensor:
     head, targets = parts(model).head, rows.learn[:, 1:]
-    hidden = hidden_states(model, rows)[:, :-1][targets].to(head.weight.dtype)
+    hidden = hidden[:, :-1][targets].to(head.weight.dtype)
     with torch.autocast(hidden.device.type, enabled=False):
         return -token_statistics(hidden, head, rows.tokens[:, 1:][targets], Sampling()).logp.sum()
+
+
+class RouterLoss:
+    """The loss that keeps the experts of a mixture evenly used, where the model's configuration asks for it
+    (output_router_logits), computed by the model itself: its own function, coefficient included.
+    """
+
+    def __init__(self, model: PreTrainedModel, notify: Callable[[str], None], *, packed: bool) -> None:
+        config = model.config.get_text_config()
+        self.model, self.weight = model, 0.0
+        asked = getattr(config, "output_router_logits", False)
+        weight = getattr(model, "router_aux_loss_coef", getattr(config, "router_aux_loss_coef", 0.0))
+        if not asked or not weight:
+            return
+        reason = "rows of several texts (--pack) have no mask that it could read" if packed else ""
+        if not reason:
+            text = Example(tuple(range(4)), (False, True, True, True))
+            try:
+                with torch.no_grad():
+                    self._pass(row_of([text]).to(model.device))
+                self.weight = float(weight)
+                return
+            except LOOKING_BACK as error:
+                reason = f"{type(model).__name__} gives none ({error})"
+        notify(
+            "config.json asks for a router auxiliary loss (output_router_logits). It is not used: "
+            f"{reason}. Experts may come to be used unevenly."
+        )
+
+    def sums(self, rows: Packed) -> tuple[Tensor, dict[str, Tensor]]:
+        """`token_loss` of the rows plus the weighted router loss, which counts once a token; and the router
+        loss by itself.
+        """
+        if not self.weight:
+            return token_loss(self.model, rows), {}
+        hidden, router = self._pass(rows)
+        share = router * rows.learn.sum()
+        return _loss_of(self.model, hidden, rows) + self.weight * share, {"router_loss": share.detach()}
+
+    def _pass(self, rows: Packed) -> tuple[Tensor, Tensor]:
+        """Hidden states and the router loss of one forward pass through the model as it stands."""
+        states: list[Tensor] = []
+
+        def keep(module: nn.Module, inputs: tuple[Any, ...], output: Any) -> None:
+            states.append(output.last_hidden_state)
+
+        handle = parts(self.model).base.register_forward_hook(keep)
+        try:
+            out = self.model(
+                input_ids=rows.tokens, attention_mask=(rows.segments != PADDING).long(), use_cache=False,
+                output_router_logits=True, logits_to_keep=1,
+            )  # fmt: skip
+        finally:
+            handle.remove()
+        if not isinstance(getattr(out, "aux_loss", None), Tensor):
+            raise ValueError("its output holds no aux_loss")
+        return states[0], out.aux_loss
 
 
 @torch.no_grad()
@@ -132,9 +234,11 @@ def _objective(
     model, size = loaded.model, settings.micro_batch_size or settings.minibatch_size
     rows, held = _rows(settings, loaded, given, listeners)
 
+    router = RouterLoss(model, listeners.warn, packed=settings.pack)
+
     def loss(items: Sequence[Packed]) -> tuple[Tensor, dict[str, Tensor]]:
         with precision(settings):
-            return token_loss(model, collate(items).to(model.device)), {}
+            return router.sums(collate(items).to(model.device))
 
     def evaluate() -> dict[str, float]:
         with precision(settings):
