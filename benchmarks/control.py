@@ -154,7 +154,8 @@ def table() -> str:
         if not path.is_file():
             continue
         row = json.loads(path.read_text())
-        score = f"**{row['mean']:,.1f}** ± {row['ci95']:,.1f}"
+        interval = f" ± {row['ci95']:,.1f}" if len(row["runs"]) > 1 else ""  # one seed shows no spread
+        score = f"**{row['mean']:,.1f}**{interval}"
         peer = PEERS[task] if algorithm == "ppo" else ""
         lines.append(
             f"| {task} | {algorithm} | {steps:,} | {score} | {row['min']:,.1f} | "

@@ -437,6 +437,8 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--cost", type=int, metavar="STEPS", help="measure checkpoints instead")
     parser.add_argument("--out", type=Path, help="JSON to write, or to add to")
     given = parser.parse_args(words)
+    for name in sorted(set(STORIES) - set(here)):
+        print(f"{name} needs {NEEDS[name]}, which is not installed: left out unless named", file=sys.stderr)
     import torch
 
     torch.set_num_threads(1)
