@@ -149,7 +149,9 @@ BROUGHT_BY = {
     "mujoco": "gymnasium",
     "box2d": "gymnasium",
 }
-OF_THE_USER = {"datasets"}  # a hub data set: the error names the package to install
+# used where the user has them: the error names the package (datasets, which brings pyarrow), the card of an
+# adapter says "not tried" (peft)
+OF_THE_USER = {"datasets", "pyarrow", "peft"}
 
 
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported():

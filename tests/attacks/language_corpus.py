@@ -189,7 +189,7 @@ def of_runs() -> list[Attack]:
             edit("settings.json", reward=f"x.py:f; {MARK}"),
             "--reward FILE.py:function",
         ),
-        Attack("rewards in a list", edit("settings.json", reward=[code]), "reward is"),
+        Attack("rewards in a list", edit("settings.json", reward=[code]), f"--reward {code}"),
         Attack("gold names code", both(file, edit("settings.json", gold=code)), f"--gold {code}"),
         Attack("gold is a lambda", edit("settings.json", gold="<lambda>"), "--gold FILE.py:function"),
         Attack("unknown setting", edit("settings.json", _target_=code), "no setting named '_target_'"),

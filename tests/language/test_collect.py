@@ -187,7 +187,11 @@ def test_every_metric_of_a_rollout_by_hand():
     ref_logp = torch.tensor([[-1.5, -1.0, nan], [-1.0, -1.0, -1.0], [-0.25, nan, nan]])
     sampled = logp + torch.tensor([[0.01, -0.03, 9.0], [0.02, 0.0, 0.0], [0.0, 9.0, 9.0]])
     responses = SimpleNamespace(
-        tokens=torch.zeros(3, 3), mask=mask, logp=sampled, ended=torch.tensor([True, True, False])
+        tokens=torch.zeros(3, 3),
+        mask=mask,
+        logp=sampled,
+        ended=torch.tensor([True, True, False]),
+        stopped=None,
     )
     experience = SimpleNamespace(
         responses=responses, logp=logp, ref_logp=ref_logp, seconds=2.0,

@@ -155,7 +155,7 @@ def test_other_bad_sources(tmp_path):
     for source, message in [
         (tmp_path / "x.txt", "not UTF-8"),
         (tmp_path / "absent.jsonl", "no file"),
-        (tmp_path, "no file"),
+        (tmp_path, "a folder without"),
         ({"train": [], "test": []}, "mapping of train, test"),
         (3, "is int; expected a file"),
         ([{"text": "a"}, 5], r"data\[1\] is int"),

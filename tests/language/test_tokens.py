@@ -434,9 +434,9 @@ def test_tokens_beyond_the_embedding_that_no_text_has_are_named(tmp_path):
     assert any("tokens beyond the 64 ids of the model: '<tool>'." in text for text in texts)
     make_roles(AlignSettings(model=path), notify=heard.append)
     assert any("'<tool>'" in text for text in heard if isinstance(text, str))
-    finding = check_model(path)[0]
+    finding = check_model(path)[1]
     assert finding.good and "64 ids, 0 of which" in finding.seen and "'<tool>'" in finding.seen
-    finding = check_model(added(tmp_path / "chat", template=True))[0]
+    finding = check_model(added(tmp_path / "chat", template=True))[1]
     assert not finding.good and "resize_token_embeddings" in finding.advice
 
 
