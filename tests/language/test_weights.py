@@ -40,7 +40,7 @@ def models(tmp_path_factory) -> dict[str, str]:
 def changed(folder: str, to: Path, change: Callable[[State], State]) -> str:
     """A copy of a model folder with other weights."""
     shutil.copytree(folder, to)
-    state = {name: x.contiguous() for name, x in change(load_file(to / "model.safetensors")).items()}
+    state = {name: x.clone() for name, x in change(load_file(to / "model.safetensors")).items()}
     save_file(state, to / "model.safetensors", metadata={"format": "pt"})
     return str(to)
 
@@ -90,6 +90,14 @@ WRONG = {
     "scales": (
         "llama", with_more(model__layers__0__mlp__up_proj__weight_scale_inv=torch.ones(1)), "not quantised"
     ),
+    "a norm": (
+        "llama", with_more(model__layers__0__self_attn__q_norm__weight=torch.ones(4)),
+        r"1 weights .*have no place: model\.layers\.0\.self_attn\.q_norm\.weight",
+    ),
+    "a layer": (
+        "llama", lambda s: s | {k.replace("layers.1", "layers.7"): x for k, x in s.items() if ".1." in k},
+        r"9 weights .*have no place: model\.layers\.7\..* config\.json",
+    ),
     "an adapter beside": (
         "llama", with_more(model__layers__0__mlp__up_proj__lora_A__weight=torch.ones(2, 16)), "merge_and"
     ),
@@ -109,6 +117,22 @@ def test_weights_that_are_not_the_file_s_are_refused_with_their_names(models, tm
 @pytest.mark.filterwarnings("error")
 def test_whole_models_load_without_a_word(models, name):
     load_causal(models[name])
+
+
+def test_what_older_versions_computed_and_saved_is_no_weight(models, tmp_path):
+    extra = with_more(
+        model__layers__0__self_attn__masked_bias=torch.ones(1),
+        model__layers__0__self_attn__turn__inv_freq=torch.ones(2),
+    )
+    with pytest.warns(UserWarning, match="holds 2 weights that LlamaForCausalLM does not use"):
+        load_causal(changed(models["llama"], tmp_path / "model", extra))
+
+
+def test_a_reward_model_is_no_policy_also_with_a_tied_head(tmp_path):
+    """A tied head lacks nothing: it is the embedding, which a reward model has too."""
+    model = tiny_of("Llama", "SequenceClassification", num_labels=1, tie_word_embeddings=True)
+    with pytest.raises(ValueError, match="LlamaForSequenceClassification, which scores"):
+        load_causal(saved(tmp_path / "reward", model))
 
 
 def test_weights_of_parts_that_the_model_lacks_are_told_once(models, tmp_path):

@@ -77,9 +77,18 @@ def load_causal(
 ) -> Any:
     """The model, ready to sample and to train: dropout is 0 in every module, so that both see one policy.
 
-    Raises ValueError for a model that `parts` refuses, and WrongWeights, which is one, as `pretrained` does.
+    Raises ValueError for a reward model and for a model that `parts` refuses, and WrongWeights, which is one,
+    as `pretrained` does.
     """
     from transformers import AutoModelForCausalLM
+
+    config = Path(folder) / "config.json"
+    kinds = (read_object(config).get("architectures") or [""]) if config.is_file() else [""]
+    if str(kinds[0]).endswith("Classification"):  # with a tied head, no weight of a language model is missing
+        raise ValueError(
+            f"{folder} holds {kinds[0]}, which scores or classifies texts; expected a causal language model, "
+            "such as the model it was trained from."
+        )
 
     model = fused(pretrained, AutoModelForCausalLM, folder, notify=notify, dtype=dtype)
     without_dropout(model)

@@ -33,8 +33,9 @@ def require_weights(
     tied weights, and buffers that an architecture computes itself, are not in it.
 
     Refused are weights that transformers would make up, because they are missing or have another shape, and
-    weights that belong to a module that has no place for them, such as a bias or a PEFT adapter. Other
-    unused weights are told. ``read``: names of weights that the caller reads from the file itself.
+    weights that belong to a module that has no place for them: a bias, a PEFT adapter, a norm, a layer beyond
+    those of config.json. Other unused weights are told: a tower or a head beside the trunk. ``read``: names
+    of weights that the caller reads from the file itself.
     """
     name, missing = type(model).__name__, sorted(report["missing_keys"])
     unused = sorted(set(report["unexpected_keys"]) - set(read))
@@ -70,11 +71,17 @@ def _few(words: list[str]) -> str:
 
 
 def _belongs_inside(model: nn.Module, key: str) -> bool:
-    """Whether the innermost module that a weight is named after has weights of its own."""
+    """Whether the innermost module that a weight is named after has weights of its own, or lies inside the
+    trunk and lacks the part that the weight is of. What is computed is no weight: rotary frequencies that
+    older versions saved, and masks directly in such a module.
+    """
     words, module = key.split("."), model
+    trunk = getattr(model, "base_model", model)
     for word in words[:-1]:
         inner = module._modules.get(word)
         if inner is None:
+            if module not in (model, trunk) and not key.endswith("inv_freq"):
+                return True
             break
         module = inner
     return next(module.parameters(recurse=False), None) is not None
