@@ -88,7 +88,7 @@ KEPT = ("A_log", "dt_", "rglru", "conv", "recurrent_param", "time_", "decay", "r
 
 
 class Unfit(Exception):
-    """What the doctor finds wrong with a model."""
+    """What the doctor finds wrong with a model, or the card of an adapter says of PEFT."""
 
 
 class CannotBuild(Exception):
@@ -280,6 +280,9 @@ def peft(folder: str, work: Path) -> float:
 
     if not (work / "sft/adapter").is_dir():
         raise ValueError("no adapter folder was written")
+    card = (work / "sft/adapter/README.md").read_text()
+    if "PeftModel" not in card:
+        raise Unfit(card.strip().splitlines()[-1])
     base = AutoModelForCausalLM.from_pretrained(folder, trust_remote_code=False).eval()
     model = PeftModel.from_pretrained(base, work / "sft/adapter").eval()
     return _gap(_logits(model), json.loads((work / "trained.json").read_text()))

@@ -9,7 +9,7 @@ import torch
 from language.tiny import VOCABULARY, padded, saved, tokenizer
 
 from tightrope.algorithms.descent import SamplingMismatch
-from tightrope.language import SFTSettings, align, selfcheck, train_sft
+from tightrope.language import RewardSettings, SFTSettings, align, selfcheck, train_reward, train_sft
 from tightrope.language.alignment.figures import check_mismatch
 from tightrope.language.data.batching import Example, collate, row_of
 from tightrope.language.generation.distribution import Sampling, token_statistics
@@ -25,9 +25,10 @@ from tightrope.language.memory import Job, ledger, reward_model_bytes
 from tightrope.language.model import architecture as parts_module
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import attention_window, parts
-from tightrope.language.model.load import load_causal
+from tightrope.language.model.load import HEAD, load_causal
+from tightrope.language.model.saving import save_adapter
 from tightrope.language.model.trunk import Trunk
-from tightrope.language.reward.model import load_reward
+from tightrope.language.reward.model import load_reward, write_head
 from tightrope.language.supervised.sft import require_packable, token_loss
 
 COMMON = {
@@ -65,6 +66,13 @@ FAMILIES = {
     "openai-gpt": ("OpenAIGPT", {**IDS, "n_positions": 96, "n_embd": 32, "n_layer": 3, "n_head": 2,
                                  "initializer_range": 0.3}),
     "rwkv": ("Rwkv", {**IDS, "hidden_size": 32, "num_hidden_layers": 3, "context_length": 96}),
+    "codegen": ("CodeGen", {**IDS, "n_positions": 96, "n_ctx": 96, "n_embd": 32, "n_layer": 3, "n_head": 4,
+                            "rotary_dim": 4}),
+    "projected": ("OPT", {**COMMON, "ffn_dim": 48, "word_embed_proj_dim": 16, "do_layer_norm_before": False}),
+    "longcat": ("LongcatFlash", {
+        **COMMON, "num_layers": 2, "num_hidden_layers": 4, "ffn_hidden_size": 48, "q_lora_rank": 16,
+        "kv_lora_rank": 8, "qk_nope_head_dim": 8, "qk_rope_head_dim": 8, "head_dim": 8, "v_head_dim": 8,
+        "moe_topk": 2, "n_routed_experts": 4, "zero_expert_num": 2, "expert_ffn_hidden_size": 16}),
     "bloom": (
         "Bloom", {"hidden_size": 32, "n_layer": 3, "n_head": 2, "initializer_range": 0.3,
                   **{k: COMMON[k] for k in ("vocab_size", "bos_token_id", "eos_token_id", "pad_token_id")}},
@@ -411,3 +419,75 @@ def test_a_model_that_reads_padding_is_refused_by_align_and_found_by_the_doctor(
     assert not (tmp_path / "run").exists()
     bad = [finding.what for finding in selfcheck.check_model(folder) if not finding.good]
     assert "padding on the right and on the left are one" in bad
+
+
+PAIRS = [{"prompt": "a", "chosen": x, "rejected": y} for x, y in ((" cat", " dogs"), ("x", "yz"))]
+
+
+def rewarded(model, folder, **options):
+    settings = RewardSettings(tune="full", max_tokens=20, minibatch_size=2, held_out=0.0, num_epochs=1)
+    train_reward(settings, data=PAIRS, model=(model, tokenizer()), run_dir=folder, **options)
+    return load_reward(folder)
+
+
+@pytest.mark.parametrize("name", ["rwkv", "codegen", "projected"])
+def test_reward_models_without_a_padding_id_or_with_a_projection_before_the_head(name, tmp_path):
+    """Their scores do not depend on where a text is padded: RWKV reads what comes before it."""
+    causal = made(name)
+    if name != "projected":
+        del causal.config.pad_token_id
+    model = rewarded(causal, tmp_path / "run")
+    width = 16 if name == "projected" else 32
+    assert model.head.in_features == width
+    wanted = 4 * (sum(p.numel() for p in model.base.parameters()) + width)
+    assert reward_model_bytes(tmp_path / "run") == wanted
+    tokens, real, _ = padded()
+    alone = torch.cat(
+        [model.score(row[here][None], here[here][None]) for row, here in zip(tokens, real, strict=True)]
+    )
+    torch.testing.assert_close(model.score(tokens, real), alone, rtol=1e-4, atol=1e-5)
+
+
+def test_a_bare_trunk_with_a_projection_takes_a_head_of_its_own_width(tmp_path, monkeypatch):
+    from transformers import AutoModel
+
+    model = AutoModel.from_config(config_of("projected"))
+    folder = Path(saved(tmp_path, model))
+    write_head(folder / HEAD, torch.ones(1, 16), 0.5)
+    assert load_reward(folder).head.in_features == 16
+    assert reward_model_bytes(folder) == 4 * (sum(p.numel() for p in model.parameters()) + 16)
+
+
+@pytest.mark.parametrize("stage", ["reward", "align"])
+def test_a_router_loss_that_reward_and_align_leave_out_is_told_once(stage, tmp_path):
+    lines: list[str] = []
+    listen = [lambda event: lines.append(str(event))]
+    if stage == "reward":
+        rewarded(made("router"), tmp_path / "run", listeners=listen)
+    else:
+        align(
+            model=saved(tmp_path / "model", made("router")), prompts=["a", "b"], reward="length",
+            total_episodes=2, batch_size=2, minibatch_size=2, max_new_tokens=2, lora_rank=2,
+            run_dir=tmp_path / "run", listeners=listen,
+        )  # fmt: skip
+    assert sum("output_router_logits" in line and stage in line for line in lines) == 1
+
+
+@pytest.mark.parametrize("name", ["jamba", "longcat", "granite"])
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore:.*is_gradient_checkpointing.*:FutureWarning")
+def test_where_peft_passes_an_adapter_by_the_card_says_so(name, tmp_path):
+    peft = pytest.importorskip("peft")
+    model, tokens = made(name), torch.arange(4, 20)[None]
+    lora.add_adapter(model, "policy", 4, 8.0)
+    generator = torch.Generator().manual_seed(0)
+    for parameter in lora.adapter_parameters(model, "policy"):
+        parameter.data += 0.3 * torch.randn(parameter.shape, generator=generator)
+    said = save_adapter(model, "policy", tmp_path, base_model="somewhere")
+    with torch.no_grad(), lora.using(model, "policy"):
+        wanted = model(tokens, use_cache=False).logits
+        theirs = peft.PeftModel.from_pretrained(made(name), str(tmp_path)).eval()
+        same = torch.allclose(theirs(tokens, use_cache=False).logits, wanted, atol=1e-3)
+        merged = theirs.merge_and_unload()(tokens, use_cache=False).logits
+    torch.testing.assert_close(merged, wanted, rtol=0, atol=1e-3)
+    assert same == (said is None) == (name == "granite")
+    assert said is None or ("merge_and_unload" in said and said in (tmp_path / "README.md").read_text())

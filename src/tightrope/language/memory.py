@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from tightrope.language.generation.distribution import CHUNK
 from tightrope.language.model.architecture import Parts, accepted, computes_linear, parts
-from tightrope.language.model.load import fused, pretrained, without_weights
+from tightrope.language.model.load import HEAD, fused, pretrained, read_tensors, without_weights
 from tightrope.language.settings import AlignSettings, ModelSettings, RewardSettings, SupervisedSettings
 from tightrope.training.memory import SHARE, DoesNotFit, available_memory
 
@@ -412,12 +412,19 @@ def reward_model_bytes(folder: Path) -> int:
     """The weights of the reward model in this folder as `load_reward` loads them, in float32, from its own
     config.json; 0 where there is none, which loading refuses.
     """
-    from transformers import AutoConfig, AutoModel
+    from transformers import (
+        MODEL_FOR_SEQUENCE_CLASSIFICATION_MAPPING,
+        AutoConfig,
+        AutoModel,
+        AutoModelForSequenceClassification,
+    )
 
     path = folder / "model" if (folder / "model" / "config.json").is_file() else folder
     if not (path / "config.json").is_file():
         return 0
     config = pretrained(AutoConfig, path)
+    head = read_tensors(path / HEAD)["score.weight"].numel() if (path / HEAD).is_file() else 0
+    scores = not head and type(config) in MODEL_FOR_SEQUENCE_CLASSIFICATION_MAPPING
     with torch.device("meta"):
-        base = fused(without_weights, AutoModel, config)
-    return FLOAT * (sum(p.numel() for p in base.parameters()) + config.get_text_config().hidden_size)
+        model = fused(without_weights, AutoModelForSequenceClassification if scores else AutoModel, config)
+    return FLOAT * (sum(p.numel() for p in model.parameters()) + head)

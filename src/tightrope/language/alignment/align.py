@@ -14,6 +14,7 @@ from typing import Any
 
 from tightrope.language.alignment.iteration import Trainer
 from tightrope.language.data.examples import FILES, Rows
+from tightrope.language.model.architecture import ROUTER_UNUSED, router_weight
 from tightrope.language.model.load import quiet_libraries
 from tightrope.language.reward.judge import RewardSources
 from tightrope.language.settings import AlignSettings, may_stand_in_a_file, recorded
@@ -72,6 +73,8 @@ def align(
     require_tensorboard(settings.tensorboard)
     with threads(settings.threads):
         trainer = _trainer(settings, prompts, reward, gold, events)
+        if router_weight(trainer.roles.model):
+            events.warn(ROUTER_UNUSED.format("align does not have it in its loss"))
         name = f"align-{Path(settings.model).name}-{settings.seed}"
         with Run.create(run_dir, trainer.settings.to_json(), name) as run:
             return _train(trainer, run)

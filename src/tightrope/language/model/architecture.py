@@ -25,6 +25,10 @@ WINDOW_FIELDS = ("sliding_window", "attention_chunk_size")  # how far back a lay
 FACTOR, CAP = "logit_factor", "logit_cap"  # attributes of a head that was measured
 SPAN = 100.0  # logits far beyond those of real models: a soft cap bends them
 PLATEAU = 1e6  # far beyond any cap
+ROUTER_UNUSED = (
+    "config.json asks for a router auxiliary loss (output_router_logits). It is not used: {}. Experts may "
+    "come to be used unevenly."
+)
 FACTOR_TOLERANCE = 1e-3  # relative; the same operations twice, and one multiplication
 
 
@@ -94,6 +98,14 @@ def computes_linear(module: nn.Module) -> bool:
     if not isinstance(found, Tensor) or found.shape != wanted.shape:
         return False
     return found.is_meta or not _apart(found, wanted)
+
+
+def router_weight(model: PreTrainedModel) -> float:
+    """The coefficient of the router auxiliary loss that config.json asks for; 0.0 where it asks for none."""
+    config = model.config.get_text_config()
+    if not getattr(config, "output_router_logits", False):
+        return 0.0
+    return float(getattr(model, "router_aux_loss_coef", getattr(config, "router_aux_loss_coef", 0.0)) or 0.0)
 
 
 def context_length(model: PreTrainedModel) -> int | None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 CONFIGS = ("config.json", "generation_config.json", "tokenizer_config.json", "processor_config.json")
 UNPICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 INDEX = "model.safetensors.index.json"
+HEAD = "head.safetensors"  # score.weight [1, d] and shift: beside an adapter, or beside a bare trunk
 # keys of config.json whose text may look like a path: transformers stores it and opens nothing
 TEXTS = ("_name_or_path", "name_or_path", "id2label", "label2id", "task_specific_params", "chat_template")
 MOST_LAYERS = 10_000

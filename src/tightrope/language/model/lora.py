@@ -47,6 +47,7 @@ class Adapted(nn.Module):
     def __init__(self, base: nn.Module, switch: Switch) -> None:
         super().__init__()
         self.base, self._switch = base, switch
+        self.read = False  # whether a model has read the weight of an adapter that is on
         self.down, self.up = nn.ParameterDict(), nn.ParameterDict()
         self._scale: dict[str, float] = {}
         self._folded: dict[str, Tensor] = {}
@@ -57,6 +58,7 @@ class Adapted(nn.Module):
         name = self._switch.active
         if name is None or name not in self.down:
             return self.base.weight  # type: ignore[return-value]
+        self.read = True
         return self.merged(name)
 
     def __getattr__(self, name: str) -> Any:
@@ -259,6 +261,25 @@ def repeats(model: PreTrainedModel) -> bool:
     inputs = accepted(base, input_ids=tokens, use_cache=False)
     one, two = (base(**inputs).last_hidden_state.float() for _ in range(2))
     return bool((one - two).abs().max() <= ROUNDING * one.abs().max())
+
+
+@torch.no_grad()
+def read_only(model: PreTrainedModel, name: str) -> list[str]:
+    """The paths of the adapted layers whose weight the model reads in a forward pass and never calls."""
+    base, _, head = parts(model)
+    adapted = {path: m for path, m in model.named_modules() if isinstance(m, Adapted) and name in m.down}
+    called: set[nn.Module] = set()
+    handles = [m.register_forward_hook(lambda module, *_: called.add(module)) for m in adapted.values()]
+    for module in adapted.values():
+        module.read = False
+    try:
+        with using(model, name):
+            tokens = torch.arange(8, device=head.weight.device)[None] % head.out_features
+            base(**accepted(base, input_ids=tokens, use_cache=False))
+    finally:
+        for handle in handles:
+            handle.remove()
+    return [path for path, module in adapted.items() if module.read and module not in called]
 
 
 def adapter_parameters(model: nn.Module, name: str) -> list[nn.Parameter]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from tightrope.language.model import lora
 from tightrope.language.model.architecture import parts
 from tightrope.language.model.load import read_object, read_tensors, without_weights
 from tightrope.language.model.lora import (
@@ -46,7 +47,8 @@ def save_adapter(
     """Write an adapter as PEFT reads it: adapter_config.json, adapter_model.safetensors, and a card. With
     ``score``, a head [1, d], it is the adapter of a model that scores texts.
 
-    Returns why PEFT cannot open it, a sentence that the card says too; None where it can.
+    Returns why PEFT cannot open it, or gives something else with it, in sentences that the card says too;
+    None where it gives the same.
     """
     from safetensors.torch import save_file
 
@@ -73,7 +75,7 @@ def save_adapter(
     with writing(folder):
         save_file(state, folder / "adapter_model.safetensors", metadata={"format": "pt"})
         (folder / "adapter_config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-        refused = _refused_by_peft(model, state, config)
+        refused = _refused_by_peft(model, state, config) or _passed_by(model, name)
         (folder / "README.md").write_text(_card(base_model, refused, score is not None), encoding="utf-8")
     return refused
 
@@ -118,6 +120,18 @@ def _refused_by_peft(model: PreTrainedModel, state: dict[str, Tensor], config: d
     if reason is None:
         return None
     return f"PEFT does not open this adapter ({reason}). The model folder beside it holds the whole model."
+
+
+def _passed_by(model: PreTrainedModel, name: str) -> str | None:
+    """The layers that PEFT's adapters do not reach, in sentences; None where they reach all."""
+    paths = lora.read_only(model, name)
+    if not paths:
+        return None
+    return (
+        f"PEFT opens this adapter, but gives something else than was trained: {type(model).__name__} reads "
+        f"the weight of {len(paths)} adapted layers, such as {paths[0]}, instead of calling them, and PEFT "
+        "changes only calls. Call merge_and_unload() in PEFT first, or take the model folder beside it."
+    )
 
 
 def _left_out(model: PreTrainedModel, state: dict[str, Tensor], config: dict[str, Any]) -> str | None:

@@ -16,7 +16,7 @@ from tightrope.algorithms.descent import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions, texts_of
 from tightrope.language.model import lora
-from tightrope.language.model.load import known_ids, read_metadata, weights_fingerprint
+from tightrope.language.model.load import HEAD, known_ids, read_metadata, weights_fingerprint
 from tightrope.language.model.packaged import not_on_hub
 from tightrope.language.model.trunk import Role
 from tightrope.language.policy.roles import Roles
@@ -28,7 +28,7 @@ from tightrope.language.reward.functions import (
     load_reward_function,
     unique_name,
 )
-from tightrope.language.reward.model import HEAD, RewardModel, last_real, load_reward, read_head
+from tightrope.language.reward.model import RewardModel, last_real, load_reward, read_head
 from tightrope.language.settings import AlignSettings, weighted
 
 # What a user may give: a function, the words of the command line, or the folder of a reward model; alone or

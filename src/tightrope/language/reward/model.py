@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from tightrope.language.data.batching import positions
 from tightrope.language.model.architecture import accepted
 from tightrope.language.model.load import (
+    HEAD,
     fused,
     load_tokenizer,
     pretrained,
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerBase
 
 SHIFT = "tightrope_reward_shift"  # in config.json: score = output of the head - shift
-HEAD = "head.safetensors"  # score.weight [1, d] and shift: beside an adapter, or beside a bare trunk
 BIAS = "score.bias"
 
 
@@ -65,7 +65,10 @@ class RewardModel:
     @torch.no_grad()
     def score(self, tokens: Tensor, real: Tensor) -> Tensor:
         """Scores [B] of texts [B, T] padded anywhere, with any id; ``real`` is True for their tokens."""
-        return self.raw(tokens, real) - self.shift
+        # to the right: what comes before a text changes the hidden states of some models (recurrent ones,
+        # those that count positions by themselves)
+        order = (~real).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(real.sum(1).max())]
+        return self.raw(tokens.gather(1, order), real.gather(1, order)) - self.shift
 
 
 def read_head(path: Path, width: int) -> tuple[Tensor, float]:
@@ -108,7 +111,7 @@ def load_reward(
         )
     if (path / HEAD).is_file():
         base = fused(pretrained, AutoModel, path, notify=notify, dtype=dtype)
-        weight, shift = read_head(path / HEAD, base.config.get_text_config().hidden_size)
+        weight, shift = read_head(path / HEAD, _width(base))
         head = nn.Linear(weight.shape[1], 1, bias=False).to(dtype)
         head.weight.data = weight.to(dtype)
     else:
@@ -117,6 +120,13 @@ def load_reward(
         shift = float(getattr(model.config, SHIFT, 0.0)) - _take_bias(head, path)
     without_dropout(base.eval())
     return RewardModel(base, head, shift, load_tokenizer(str(path)))
+
+
+@torch.no_grad()
+def _width(base: Any) -> int:
+    """The width of a base's hidden states, which a projection at its end may change (OPT-350m)."""
+    token = torch.zeros(1, 1, dtype=torch.long)
+    return base(**accepted(base, input_ids=token, use_cache=False)).last_hidden_state.shape[-1]
 
 
 def _classifier(path: Path, dtype: torch.dtype, notify: Callable[[str], None]) -> Any:

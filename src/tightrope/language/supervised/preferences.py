@@ -21,10 +21,10 @@ from torch import Tensor, nn
 from tightrope.language.data.batching import pad_right
 from tightrope.language.data.examples import Pair, Rows, preference_pairs, read_rows, sft_examples
 from tightrope.language.model import lora
-from tightrope.language.model.architecture import parts
-from tightrope.language.model.load import known_ids, weights_fingerprint, without_weights
+from tightrope.language.model.architecture import ROUTER_UNUSED, parts, router_weight
+from tightrope.language.model.load import HEAD, known_ids, weights_fingerprint, without_weights
 from tightrope.language.model.saving import save_adapter
-from tightrope.language.reward.model import HEAD, SHIFT, RewardModel, write_head
+from tightrope.language.reward.model import SHIFT, RewardModel, write_head
 from tightrope.language.settings import RewardSettings
 from tightrope.language.supervised.fit import Objective, Stage, micro_batches, resume_stage, train_stage
 from tightrope.language.supervised.prepare import GivenModel, Loaded, examples_of, precision
@@ -150,6 +150,8 @@ def _objective(
     size = settings.micro_batch_size or settings.minibatch_size
     head = make_head(language_head.in_features, settings.seed).to(settings.device)
     model, skeleton = RewardModel(base, head, 0.0, loaded.tokenizer), reward_skeleton(loaded)
+    if router_weight(loaded.model):
+        listeners.warn(ROUTER_UNUSED.format("reward does not have it in its loss"))
     pairs, held, texts = _data(settings, loaded, given, listeners)
 
     def loss(items: Sequence[Pair]) -> tuple[Tensor, dict[str, Tensor]]:
@@ -231,7 +233,7 @@ def reward_skeleton(loaded: Loaded) -> Any:
 
     config = copy.deepcopy(loaded.model.config)
     config.num_labels = 1
-    if config.pad_token_id in loaded.eos:
+    if getattr(config, "pad_token_id", None) in loaded.eos:  # some configurations have no such field
         # transformers reads the score before the first padding id: where that is the EOS too, it would read
         # another token than the last one, silently. Without a padding id it refuses batches instead.
         config.pad_token_id = None

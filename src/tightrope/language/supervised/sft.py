@@ -23,7 +23,13 @@ from tightrope.language.data.batching import (
 )
 from tightrope.language.data.examples import Row, Rows, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
-from tightrope.language.model.architecture import accepted, attention_window, parts
+from tightrope.language.model.architecture import (
+    ROUTER_UNUSED,
+    accepted,
+    attention_window,
+    parts,
+    router_weight,
+)
 from tightrope.language.model.load import known_ids
 from tightrope.language.model.saving import save_model
 from tightrope.language.settings import SFTSettings
@@ -128,11 +134,9 @@ class RouterLoss:
     """
 
     def __init__(self, model: PreTrainedModel, notify: Callable[[str], None], *, packed: bool) -> None:
-        config = model.config.get_text_config()
         self.model, self.weight = model, 0.0
-        asked = getattr(config, "output_router_logits", False)
-        weight = getattr(model, "router_aux_loss_coef", getattr(config, "router_aux_loss_coef", 0.0))
-        if not asked or not weight:
+        weight = router_weight(model)
+        if not weight:
             return
         reason = "rows of several texts (--pack) have no mask that it could read" if packed else ""
         if not reason:
@@ -140,14 +144,11 @@ class RouterLoss:
             try:
                 with torch.no_grad():
                     self._pass(row_of([text]).to(model.device))
-                self.weight = float(weight)
+                self.weight = weight
                 return
             except LOOKING_BACK as error:
                 reason = f"{type(model).__name__} gives none ({error})"
-        notify(
-            "config.json asks for a router auxiliary loss (output_router_logits). It is not used: "
-            f"{reason}. Experts may come to be used unevenly."
-        )
+        notify(ROUTER_UNUSED.format(reason))
 
     def sums(self, rows: Packed) -> tuple[Tensor, dict[str, Tensor]]:
         """`token_loss` of the rows plus the weighted router loss, which counts once a token; and the router
