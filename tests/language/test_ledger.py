@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from transformers import AutoModelForCausalLM, GPT2Config, LlamaConfig
+from transformers import AutoModelForCausalLM, Gemma4TextConfig, GPT2Config, LlamaConfig
 
 from tightrope.algorithms.optimise import Adam
 from tightrope.language import memory
@@ -106,6 +106,17 @@ def test_the_cache_is_the_real_cache(config) -> None:
     step = cached_forward(parts(real(config)).base, torch.zeros_like(ones), ones, places)
     cache = size_of(x for layer in step.cache.layers for x in (layer.keys, layer.values))
     assert entry(ledger(config, ALIGN), "KV cache") == cache
+
+
+def test_the_cache_of_layers_that_differ_is_the_sum_of_theirs() -> None:
+    """Two layers with heads of 8 numbers and two with 16; two heads, keys and values, float32."""
+    config = Gemma4TextConfig(
+        vocab_size=96, hidden_size=32, intermediate_size=64, num_hidden_layers=4, num_attention_heads=4,
+        num_key_value_heads=2, head_dim=8, global_head_dim=16, vocab_size_per_layer_input=96,
+        hidden_size_per_layer_input=8, num_kv_shared_layers=0,
+        layer_types=["sliding_attention", "full_attention"] * 2,
+    )  # fmt: skip
+    assert memory.shapes_of(config, "float32").kv_cache == 4 * 2 * 2 * (8 + 16 + 8 + 16)
 
 
 @CONFIGS

@@ -341,28 +341,29 @@ def shapes_of(config: PreTrainedConfig, dtype: str) -> Shapes:
     found = parts(model)
     linears = [_linears(layer) for layer in found.layers]
     inner = config.get_text_config()
-    heads, width = _cache_shape(inner)
+    # of a configuration that may differ between layers, one for each
+    layers = getattr(inner, "per_layer_config", None) or [inner] * len(linears)
     return Shapes(
         parameters=sum(p.numel() for p in model.parameters()),
         base=sum(p.numel() for p in found.base.parameters()),
         linears=linears,
         hidden=found.head.weight.shape[1],
         vocabulary=found.head.weight.shape[0],
-        kv_cache=2 * len(linears) * heads * width * kind.itemsize,
+        kv_cache=2 * sum(map(_cache_width, layers)) * kind.itemsize,
         saved=_saved_per_token(found, linears, kind.itemsize),
         item=kind.itemsize,
     )
 
 
-def _cache_shape(inner: Any) -> tuple[int, int]:
-    """Heads of the KV cache and their width; none where there is no attention: the state of a recurrent layer
-    does not grow with the text.
+def _cache_width(inner: Any) -> int:
+    """Keys of a token in the KV cache of one layer, over all heads; none where there is no attention: the
+    state of a recurrent layer does not grow with the text.
     """
     attention = getattr(inner, "num_attention_heads", None)
     if not attention:
-        return 0, 0
+        return 0
     heads = getattr(inner, "num_key_value_heads", None) or attention
-    return heads, getattr(inner, "head_dim", None) or inner.hidden_size // attention
+    return heads * (getattr(inner, "head_dim", None) or inner.hidden_size // attention)
 
 
 def _linears(layer: nn.Module) -> list[tuple[int, int]]:
