@@ -70,7 +70,37 @@ def whole(example: Example, made=None) -> str:
     return (made or tokenizer()).decode(list(example.tokens))
 
 
+def closed_vocabulary(kind: str):
+    """A tokenizer of the letters of DNA, which puts a BOS before every text and has no UNK token."""
+    from tokenizers import Regex, Tokenizer, decoders, models, pre_tokenizers, processors
+    from transformers import PreTrainedTokenizerFast
+
+    words = {word: i for i, word in enumerate(["<bos>", "<eos>", *"ACGT"])}
+    inner = Tokenizer(models.BPE(words, []) if kind == "BPE" else models.WordLevel(words))
+    inner.pre_tokenizer = pre_tokenizers.Split(Regex("[\\s\\S]"), "isolated")
+    inner.decoder = decoders.Fuse()
+    inner.post_processor = processors.TemplateProcessing(
+        single="<bos> $A <eos>", special_tokens=[("<bos>", 0), ("<eos>", 1)]
+    )
+    return PreTrainedTokenizerFast(tokenizer_object=inner, bos_token="<bos>", eos_token="<eos>")
+
+
+@pytest.mark.parametrize("kind", ["BPE", "WordLevel"])
+def test_a_tokenizer_that_knows_few_letters_keeps_its_opening(kind):
+    made = closed_vocabulary(kind)
+    (prompt,) = read_prompts(["GAT"], made, max_tokens=9)
+    assert prompt.tokens == (0, 4, 2, 5)
+    (example,) = sft_examples([{"prompt": "GA", "completion": "TC"}], made, eos=1, max_tokens=9)
+    assert example.tokens == (0, 4, 2, 5, 3, 1) and sum(example.learn) == 3
+
+
+def test_a_text_that_a_tokenizer_cannot_write_is_told_in_a_sentence():
+    with pytest.raises(ValueError, match="has no tokens for 'GxT' .*give it an UNK token"):
+        read_prompts(["GxT"], closed_vocabulary("WordLevel"), max_tokens=9)
+
+
 # ------------------------------------------------------------------------------------------------- reading
+
 
 
 def test_every_kind_of_file_gives_the_same_rows(tmp_path):

@@ -334,7 +334,7 @@ def read_prompts(
         if isinstance(shown, str):
             tokens, opening = encoder.text(shown), encoder.opening[: max_tokens - 1]
             if shown[-1].isspace():
-                blank += encoder.text(shown + "a")[: len(tokens)] != tokens
+                blank += encoder.text(shown + encoder.probe)[: len(tokens)] != tokens
         else:
             tokens, opening = encoder.prompt(shown, place, tools=columns.get("tools")), []
         encoder.require_known(tokens, f"prompt of {place}")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -12,8 +13,9 @@ Messages = list[dict[str, Any]]
 Pieces = list[tuple[list[int], bool]]  # tokens, and whether they are learnt
 Encode = Callable[[str], list[int]]
 Spans = list[tuple[int, int]]  # begin and end, of characters or of tokens
-# what a text may stand behind, so that it gets the tokens of a continuation
+# what a text may stand behind, so that it gets the tokens of a continuation; then words of the vocabulary
 ANCHORS = ("", "\n", ".", "a", " a")
+TRIED = 256  # words of a vocabulary
 
 
 class Encoder:
@@ -30,15 +32,36 @@ class Encoder:
         self.tokenizer, self.vocabulary = tokenizer, vocabulary
         self.eos = (eos,) if isinstance(eos, int) else tuple(eos)
         self.crossed = set[str]()
-        # A probe separates the opening (a BOS, or nothing) from a closing EOS, also where both are one id.
-        bare, whole = self.bare("a"), list(tokenizer("a")["input_ids"])
+        # A probe separates the opening (a BOS, or nothing) from a closing EOS, also where both are one id. A
+        # tokenizer of digits or of DNA knows no "a".
+        self.probe = next((word for word in chain(("a",), self._words()) if self._tokens(word)), "")
+        bare, whole = self._tokens(self.probe), list(tokenizer(self.probe)["input_ids"])
         starts = (i for i in range(len(whole)) if bare and whole[i : i + len(bare)] == bare)
         self.opening = whole[: next(starts, 0)]
-        self.newline = set(self.bare("\n"))
+        self.newline = set(self._tokens("\n"))
 
     def bare(self, text: str) -> list[int]:
-        """The tokens of a text and nothing else."""
-        return list(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"])
+        """The tokens of a text and nothing else. ValueError for a text that the tokenizer cannot write."""
+        try:
+            return list(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"])
+        except Exception as error:  # one without an UNK raises a bare Exception
+            raise ValueError(
+                f"The tokenizer has no tokens for {text[:80]!r} ({error}). Take out what it does not know, or "
+                "give it an UNK token."
+            ) from error
+
+    def _tokens(self, text: str) -> list[int]:
+        """As `bare`, but none for a text that the tokenizer cannot write."""
+        try:
+            return self.bare(text)
+        except ValueError:
+            return []
+
+    def _words(self) -> Iterator[str]:
+        """Texts of the first ordinary tokens of the vocabulary."""
+        special = set(self.tokenizer.all_special_ids)
+        words = (self._decoded([token]) for token in range(len(self.tokenizer)) if token not in special)
+        return islice((word for word in words if word.strip()), TRIED)
 
     def text(self, text: str) -> list[int]:
         """The tokens of a text with the tokenizer's opening, which is never put there twice."""
@@ -73,16 +96,20 @@ class Encoder:
         The rest is tokenised behind a character that leaves its tokens alone: so no blank comes before its
         first word, and half a word stays one. The row must still say what its ``whole`` tokens say.
         """
-        for said in (self._decoded, self._written):
-            for anchor in ANCHORS:
-                head = self.bare(anchor)
+        ways = (self._decoded, self._written)
+        usual = ((said, anchor) for said in ways for anchor in ANCHORS)
+        more = ((said, anchor) for anchor in self._words() for said in ways)
+        for said, anchor in chain(usual, more):
+            head = self._tokens(anchor)
+            if anchor and not head:
+                continue
 
-                def encode(part: str, anchor: str = anchor, size: int = len(head)) -> list[int]:
-                    return [*before, *self.bare(anchor + part[start:])[size:]]
+            def encode(part: str, anchor: str = anchor, size: int = len(head)) -> list[int]:
+                return [*before, *self.bare(anchor + part[start:])[size:]]
 
-                alone = self.bare(anchor + text[start:])[: len(head)] == head
-                if alone and said(encode(text)) == said(whole):
-                    return encode
+            alone = self._tokens(anchor + text[start:])[: len(head)] == head
+            if alone and said(encode(text)) == said(whole):
+                return encode
         raise ValueError(
             f"{place}: the tokenizer writes the end of the prompt in another way when the reply follows, and "
             "has no tokens for the reply alone. Part them between two words: a blank belongs to the reply."
