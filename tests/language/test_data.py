@@ -7,6 +7,7 @@ import json
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from language.tiny import tokenizer
@@ -100,6 +101,49 @@ def test_a_text_that_a_tokenizer_cannot_write_is_told_in_a_sentence():
 
 
 # ------------------------------------------------------------------------------------------------- reading
+
+
+class Table:
+    """As pandas, polars and pyarrow: its iteration gives columns, and one method gives rows."""
+
+    def __init__(self, columns: list[str], rows: list[dict], method: str = "") -> None:
+        self.columns = columns
+        if method:
+            setattr(self, method, lambda *words: rows if words == self.words(method) else None)
+
+    @staticmethod
+    def words(method: str) -> tuple:
+        return ("records",) if method == "to_dict" else ()
+
+    def __iter__(self):
+        return iter(self.columns)
+
+
+@pytest.mark.parametrize("method", ["to_dict", "to_dicts", "to_pylist"])
+def test_the_rows_of_a_table_are_read_and_not_its_columns(method):
+    rows = [{"prompt": "ab", "completion": "cd"}, {"prompt": "e", "completion": "f"}]
+    assert read_rows(Table(["prompt", "completion"], rows, method)) == rows
+    assert read_rows(Table(["prompt", "completion"], rows, method), limit=1) == rows[:1]
+    with pytest.raises(ValueError, match="data names 'prompt' twice"):
+        read_rows(Table(["prompt", "prompt"], rows, method))
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (Table(["prompt"], []), "data is Table, a table that does not give its rows; expected a list of dicts"),
+        ({"ab", "cd"}, "data is set; expected a file"),
+        (frozenset({"ab"}), "data is frozenset; expected a file"),
+        (b"ab", "data is bytes; expected a file"),
+        ([b"ab"], r"data\[0\] is bytes; expected a string"),
+        (np.array(5), "data is ndarray; expected a file"),
+        (np.array([1, 2]), r"data\[0\] is int64; expected a string"),
+        (np.array([["ab", "cd"]]), r"data\[0\] is ndarray; expected a string"),
+    ],
+)
+def test_what_has_no_rows_in_an_order_is_refused(source, message):
+    with pytest.raises(ValueError, match=message):
+        read_rows(source)
 
 
 

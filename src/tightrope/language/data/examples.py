@@ -59,9 +59,9 @@ def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
 
     ``source``: a .jsonl, .json (a list), .csv or .txt file (a string a line), a .parquet file, a folder that
     ``save_to_disk`` wrote (``folder`` or ``folder:split``), the id of a dataset on the hub (``id``,
-    ``id:split`` or ``id:config:split``; these three need the package datasets), a list of strings, dicts or
-    message lists, or anything that yields dicts, as datasets.Dataset does (without the nulls that it puts
-    into chats). Strings stay strings, and a list of messages is read as ``{"prompt": messages}``. ValueError
+    ``id:split`` or ``id:config:split``; these three need the package datasets), a table of pandas, polars or
+    pyarrow, a list of strings, dicts or message lists, or anything that yields dicts, as datasets.Dataset
+    does (without the nulls that tables put into chats). Strings stay strings, and a list of messages is read as ``{"prompt": messages}``. ValueError
     when there is nothing to read, a row is none of these, or a column occurs twice in a file's row or header.
     """
     name = str(source) if isinstance(source, str | Path) else "data"
@@ -72,9 +72,12 @@ def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
         raise ValueError(
             f"{name} is a mapping of {keys}; expected rows. Pass one of its parts, or a list of dicts."
         )
-    if not isinstance(source, Iterable):
+    arrow = type(source).__module__.partition(".")[0] == "datasets" or hasattr(source, "columns")
+    if hasattr(source, "columns"):
+        source = _records(source)
+    # a set has no order to repeat, and bytes and numbers have no rows
+    if isinstance(source, bytes | bytearray | set | frozenset) or not np.iterable(source):
         raise ValueError(f"{name} is {type(source).__name__}; expected a file, a dataset or a list of rows.")
-    arrow = type(source).__module__.partition(".")[0] == "datasets"
     rows: list[Row] = []
     for number, row in enumerate(islice(source, limit)):
         if isinstance(row, list) and row and all(isinstance(message, Mapping) for message in row):
@@ -88,6 +91,18 @@ def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
     if not rows:
         raise ValueError(f"{name} holds no rows.")
     return rows
+
+
+def _records(table: Any) -> Any:
+    """The rows of a table, as dicts: what pandas, polars and pyarrow iterate over are its columns."""
+    _each_once([str(name) for name in getattr(table, "column_names", table.columns)], "data")
+    for method, given in (("to_pylist", ()), ("to_dicts", ()), ("to_dict", ("records",))):
+        if hasattr(table, method):
+            return getattr(table, method)(*given)
+    raise ValueError(
+        f"data is {type(table).__name__}, a table that does not give its rows; expected a list of dicts, one "
+        "a row. Make one of it, or a table of pandas, polars or pyarrow."
+    )
 
 
 def without_nulls(row: Mapping[str, Any]) -> dict[str, Any]:
