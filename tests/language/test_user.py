@@ -275,6 +275,38 @@ def test_a_stop_string_ends_a_row_where_its_last_token_completes_it():
             assert texts_of(words, [ids], (stop,)) == [said[: -len(stop)]]
 
 
+def marked():
+    """The tokenizer with a special token that is no EOS, with the id of the letter e."""
+    from tokenizers import Tokenizer
+    from transformers import AddedToken, PreTrainedTokenizerFast
+
+    told = json.loads(tokenizer()._tokenizer.to_str())
+    told["model"]["vocab"]["<|im_end|>"] = told["model"]["vocab"].pop("e")
+    made = PreTrainedTokenizerFast(
+        tokenizer_object=Tokenizer.from_str(json.dumps(told)), eos_token="<eos>", unk_token="<unk>"
+    )
+    made.add_tokens([AddedToken("<|im_end|>", special=True, normalized=False)])
+    assert made.convert_tokens_to_ids("<|im_end|>") == WORDS.index("e")
+    return made
+
+
+def test_a_special_token_that_is_no_eos_may_be_a_stop(tmp_path):
+    words, end = marked(), WORDS.index("e")
+    row = [WORDS.index("a"), end, WORDS.index("b")]
+    assert meets_stop([row[:1], row[:2]], words, ("<|im_end|>", "x")) == [False, True]
+    assert texts_of(words, [row, row[:1]], ("<|im_end|>", "x")) == ["a", "a"]
+    assert texts_of(words, [row], ("x",)) == ["ab"]
+    folder = saved(tmp_path / "model")
+    words.save_pretrained(folder)
+    values = {"total_episodes": 32, "batch_size": 32, "minibatch_size": 32, "max_new_tokens": 12, "lora_rank": 2}
+    given = {"model": folder, "prompts": ["ab", "cd"], "reward": "length", **values}
+    run = align(**given, run_dir=tmp_path / "run", stop=("<|im_end|>",), seed=1)
+    assert run.metrics[0]["objective/stop_fraction"] > 0
+    with pytest.raises(ValueError, match="holds the special token '<|im_end|>' and other text"):
+        align(**given, run_dir=tmp_path / "other", stop=("<|im_end|>\n",))
+    assert not (tmp_path / "other").exists()
+
+
 def letter(token):
     return WORDS[token] if token < len(WORDS) else "-"  # the model has a few more ids
 

@@ -149,22 +149,49 @@ def sample(
 
 
 def meets_stop(rows: list[list[int]], tokenizer: PreTrainedTokenizerBase, stop: Sequence[str]) -> list[bool]:
-    """Of rows of tokens that grow one by one, whose text has just come to one of the stop strings.
+    """Of rows of tokens that grow one by one, which have just come to one of the stop strings: their text, or
+    their last token where a stop is a special token.
 
     Only the end of a row is read: a stop string has no more tokens than bytes; some more, because a tokenizer
     may write the first of a text in another way.
     """
     size = max(len(text.encode()) for text in stop) + 8
     texts = tokenizer.batch_decode([row[-size:] for row in rows], skip_special_tokens=True)
-    return [any(word in text for word in stop) for text in texts]
+    ids = special_stops(tokenizer, stop)
+    return [row[-1] in ids or any(word in text for word in stop) for row, text in zip(rows, texts, strict=True)]
 
 
 def texts_of(
     tokenizer: PreTrainedTokenizerBase, rows: Sequence[list[int]], stop: Sequence[str] = ()
 ) -> list[str]:
     """What rows of tokens say: special tokens are left out, and so is a stop string with all behind it."""
-    texts = [str(tokenizer.decode(row, skip_special_tokens=True)) for row in rows]
+    ids = special_stops(tokenizer, stop)
+    ends = [next((i for i, token in enumerate(row) if token in ids), None) for row in rows]
+    texts = [
+        str(tokenizer.decode(row[:end], skip_special_tokens=True))
+        for row, end in zip(rows, ends, strict=True)
+    ]
     return [text[: min((text.index(word) for word in stop if word in text), default=None)] for text in texts]
+
+
+def special_stops(tokenizer: PreTrainedTokenizerBase, stop: Sequence[str]) -> set[int]:
+    """The ids of stop strings that are special tokens, which no text shows. ValueError for a stop string that
+    has one beside other text: it would never be met.
+    """
+    found = set()
+    for word in stop:
+        known = tokenizer.convert_tokens_to_ids(word)
+        if known is not None and tokenizer.convert_ids_to_tokens(known) == word:
+            if not tokenizer.decode([known], skip_special_tokens=True):
+                found.add(known)
+            continue
+        for token in tokenizer.added_tokens_decoder.values():
+            if token.special and token.content in word:
+                raise ValueError(
+                    f"stop {word!r} holds the special token {token.content!r} and other text; expected text, "
+                    "or a special token alone. Give them as two stops."
+                )
+    return found
 
 
 def draw(

@@ -20,7 +20,7 @@ import torch
 from torch import nn
 
 from tightrope.language.generation.distribution import Sampling, token_statistics
-from tightrope.language.generation.sample import GapLimits, cache_works, gap_limits
+from tightrope.language.generation.sample import GapLimits, cache_works, gap_limits, special_stops
 from tightrope.language.memory import job_of, require_memory, reward_model_bytes
 from tightrope.language.model import lora
 from tightrope.language.model.architecture import parameter_counts, parts
@@ -160,6 +160,7 @@ def make_roles(
     _require_memory(folder, settings, kind, notify, own_reward)
     tokenizer, model = load_tokenizer(folder), load_causal(folder, dtype, warn).to(device)
     stops, cut = eos_ids(model, tokenizer), 0
+    special_stops(tokenizer, settings.stop)  # refuses what would never be met
     if strangers := unreadable(model, tokenizer):
         notify(strangers)
     again = functools.partial(load_causal, folder, dtype, lambda text: None)  # what it tells was told above
