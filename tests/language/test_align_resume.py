@@ -13,12 +13,15 @@ import torch
 from language.tiny import saved, tiny_llama
 
 from tightrope.algorithms import descent
+from tightrope.cli.flags import UsageError
 from tightrope.cli.main import main
+from tightrope.cli.options import training_options
 from tightrope.language.alignment import align as alignment
 from tightrope.language.alignment import iteration as trainer
 from tightrope.language.alignment.align import align, resume_align
 from tightrope.language.alignment.iteration import Trainer
 from tightrope.language.compare import sample_run
+from tightrope.language.settings import AlignSettings
 from tightrope.runs import checkpoint, signals
 from tightrope.runs.lock import RunInUse
 from tightrope.runs.run import Run
@@ -174,6 +177,25 @@ def test_a_function_must_be_named_again_whatever_its_name(tmp_path, values, monk
         align(run_dir=tmp_path / name / "run", **given, **{**values, "total_episodes": 8})
         with pytest.raises(ValueError, match=f"The reward of .* was '<{name}>': code"):
             resume_align(tmp_path / name / "run", **{**given, "reward": None}, total_episodes=16)
+
+
+def test_the_advice_names_every_reward_with_its_weight(tmp_path, values, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    settings = AlignSettings(
+        model=values["model"], data="<list>", reward=("folder=2", "length=0.01", "judge.py:good=0.1", "<own>=3")
+    )
+    typed = (
+        "tightrope resume run --reward folder=2.0 --reward length=0.01 --reward judge.py:good=0.1 "
+        "--reward FILE.py:function=3.0"
+    )
+    with pytest.raises(ValueError) as caught:
+        alignment._require_what_no_file_gives("run", settings, PROMPTS, None, None)
+    assert str(caught.value).endswith(typed)
+    (tmp_path / "settings.json").write_text(json.dumps(settings.with_values(data="x.txt").to_json()))
+    with pytest.raises(UsageError) as refused:
+        training_options("align", ["--settings", "settings.json"])
+    assert str(refused.value).endswith(typed.partition("run ")[2])
 
 
 def test_other_prompts_and_less_than_was_done_are_refused(tmp_path, values, whole):

@@ -34,6 +34,7 @@ from tightrope.language.settings import (
     RewardSettings,
     SFTSettings,
     may_stand_in_a_file,
+    typed_again,
 )
 from tightrope.runs.folders import command_of
 from tightrope.runs.records import retyped
@@ -484,10 +485,11 @@ def _refuse_code(command: str, path: str, name: str, value: Any) -> None:
     judge = name in ("reward", "gold") and not all(may_stand_in_a_file(word) for word in words if word)
     module = name == "env" and ":" in value
     if judge or module or (isinstance(value, str) and value.startswith("<")):
-        word = "FILE.py:function" if name in ("reward", "gold") else "ID" if name == "env" else "FILE"
         flag = "" if name == "env" else f"--{name.replace('_', '-')} "
+        word = "ID" if name == "env" else "FILE"
+        again = typed_again(flag.strip(), words) if name in ("reward", "gold") else flag + retyped(value, word)
         raise UsageError(
             f"--settings {path}: {name} was {' '.join(map(repr, words))}, which no file may name: an object, "
             f"code, or a folder that is gone. Give it again: {PROGRAM} {command} --settings "
-            f"{shlex.quote(path)} {flag}{' '.join(retyped(one, word) for one in words)}"
+            f"{shlex.quote(path)} {again}"
         )

@@ -254,7 +254,8 @@ def _command(typed: str, run: str, given: Options, model: str = "") -> str:
         for judge in ("reward", "gold"):
             named = settings.get(judge) or ()
             if ".py:" in str(named):
-                words += [f"--{judge}", *([named] if isinstance(named, str) else named)]
+                for word in [named] if isinstance(named, str) else named:
+                    words += [f"--{judge}", word]
     return shlex.join(words)
 
 

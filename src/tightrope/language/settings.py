@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from tightrope.algorithms.settings import PPOSettings
+from tightrope.runs.records import retyped
 from tightrope.settings.fields import SCHEDULES, Schedule, fixed, of_update_rule, setting
 from tightrope.settings.values import Settings
 
@@ -332,6 +334,18 @@ def weighted(word: str) -> tuple[str, float]:
         with contextlib.suppress(ValueError):
             return name, float(number)
     return word, 1.0
+
+
+def typed_again(flag: str, words: Iterable[str]) -> str:
+    """Judges as flags to type again, each with its weight: FILE.py:function in place of an object, a folder
+    that is gone, and what a user should not copy.
+    """
+    typed = []
+    for word in words:
+        name, weight = weighted(word)
+        again = retyped(name, "FOLDER" if may_stand_in_a_file(word) else "FILE.py:function")
+        typed.append(f"{flag} {again}" + (f"={weight}" if weight != 1 else ""))
+    return " ".join(typed)
 
 
 def may_stand_in_a_file(word: str) -> bool:

@@ -17,11 +17,10 @@ from tightrope.language.data.examples import FILES, Rows
 from tightrope.language.model.architecture import ROUTER_UNUSED, router_weight
 from tightrope.language.model.load import quiet_libraries
 from tightrope.language.reward.judge import RewardSources
-from tightrope.language.settings import AlignSettings, may_stand_in_a_file, recorded
+from tightrope.language.settings import AlignSettings, may_stand_in_a_file, recorded, typed_again
 from tightrope.language.supervised.prepare import threads
 from tightrope.runs import signals
 from tightrope.runs.folders import require_kind
-from tightrope.runs.records import retyped
 from tightrope.runs.run import Run
 from tightrope.training import loop
 from tightrope.training.events import Listener, Listeners
@@ -143,11 +142,10 @@ def _require_what_no_file_gives(
         known = getattr(settings, name) or ()
         words = (known,) if isinstance(known, str) else known
         if value is None and not all(map(may_stand_in_a_file, words)):
-            again = " ".join(retyped(word, "FILE.py:function") for word in words)
             raise ValueError(
                 f"The {name} of {run_dir} was {' '.join(map(repr, words))}: code, which no file may import, "
                 "or a folder that is not there any more. If it is yours, or you have read it, name it again: "
-                f"tightrope resume {shlex.quote(str(run_dir))} --{name} {again}"
+                f"tightrope resume {shlex.quote(str(run_dir))} {typed_again(f'--{name}', words)}"
             )
     moved = Path(settings.data).suffix.lower() in FILES and not Path(settings.data).is_file()
     if prompts is None and (moved or settings.data.startswith("<")):
