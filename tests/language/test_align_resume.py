@@ -183,7 +183,9 @@ def test_the_advice_names_every_reward_with_its_weight(tmp_path, values, monkeyp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
     settings = AlignSettings(
-        model=values["model"], data="<list>", reward=("folder=2", "length=0.01", "judge.py:good=0.1", "<own>=3")
+        model=values["model"],
+        data="<list>",
+        reward=("folder=2", "length=0.01", "judge.py:good=0.1", "<own>=3"),
     )
     typed = (
         "tightrope resume run --reward folder=2.0 --reward length=0.01 --reward judge.py:good=0.1 "

@@ -131,7 +131,10 @@ def test_the_rows_of_a_table_are_read_and_not_its_columns(method):
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (Table(["prompt"], []), "data is Table, a table that does not give its rows; expected a list of dicts"),
+        (
+            Table(["prompt"], []),
+            "data is Table, a table that does not give its rows; expected a list of dicts",
+        ),
         ({"ab", "cd"}, "data is set; expected a file"),
         (frozenset({"ab"}), "data is frozenset; expected a file"),
         (b"ab", "data is bytes; expected a file"),
@@ -144,7 +147,6 @@ def test_the_rows_of_a_table_are_read_and_not_its_columns(method):
 def test_what_has_no_rows_in_an_order_is_refused(source, message):
     with pytest.raises(ValueError, match=message):
         read_rows(source)
-
 
 
 def test_every_kind_of_file_gives_the_same_rows(tmp_path):

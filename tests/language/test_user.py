@@ -298,7 +298,13 @@ def test_a_special_token_that_is_no_eos_may_be_a_stop(tmp_path):
     assert texts_of(words, [row], ("x",)) == ["ab"]
     folder = saved(tmp_path / "model")
     words.save_pretrained(folder)
-    values = {"total_episodes": 32, "batch_size": 32, "minibatch_size": 32, "max_new_tokens": 12, "lora_rank": 2}
+    values = {
+        "total_episodes": 32,
+        "batch_size": 32,
+        "minibatch_size": 32,
+        "max_new_tokens": 12,
+        "lora_rank": 2,
+    }
     given = {"model": folder, "prompts": ["ab", "cd"], "reward": "length", **values}
     run = align(**given, run_dir=tmp_path / "run", stop=("<|im_end|>",), seed=1)
     assert run.metrics[0]["objective/stop_fraction"] > 0

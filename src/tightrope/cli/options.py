@@ -487,7 +487,9 @@ def _refuse_code(command: str, path: str, name: str, value: Any) -> None:
     if judge or module or (isinstance(value, str) and value.startswith("<")):
         flag = "" if name == "env" else f"--{name.replace('_', '-')} "
         word = "ID" if name == "env" else "FILE"
-        again = typed_again(flag.strip(), words) if name in ("reward", "gold") else flag + retyped(value, word)
+        again = (
+            typed_again(flag.strip(), words) if name in ("reward", "gold") else flag + retyped(value, word)
+        )
         raise UsageError(
             f"--settings {path}: {name} was {' '.join(map(repr, words))}, which no file may name: an object, "
             f"code, or a folder that is gone. Give it again: {PROGRAM} {command} --settings "

@@ -61,8 +61,9 @@ def read_rows(source: Rows, limit: int | None = None) -> list[Row]:
     ``save_to_disk`` wrote (``folder`` or ``folder:split``), the id of a dataset on the hub (``id``,
     ``id:split`` or ``id:config:split``; these three need the package datasets), a table of pandas, polars or
     pyarrow, a list of strings, dicts or message lists, or anything that yields dicts, as datasets.Dataset
-    does (without the nulls that tables put into chats). Strings stay strings, and a list of messages is read as ``{"prompt": messages}``. ValueError
-    when there is nothing to read, a row is none of these, or a column occurs twice in a file's row or header.
+    does (without the nulls that tables put into chats). Strings stay strings, and a list of messages is read
+    as ``{"prompt": messages}``. ValueError when there is nothing to read, a row is none of these, or a column
+    occurs twice in a file's row or header.
     """
     name = str(source) if isinstance(source, str | Path) else "data"
     if isinstance(source, str | Path):

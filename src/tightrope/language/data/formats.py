@@ -46,8 +46,8 @@ class Encoder:
             return list(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"])
         except Exception as error:  # one without an UNK raises a bare Exception
             raise ValueError(
-                f"The tokenizer has no tokens for {text[:80]!r} ({error}). Take out what it does not know, or "
-                "give it an UNK token."
+                f"The tokenizer has no tokens for {text[:80]!r} ({error}). Take out what it does not know, "
+                "or give it an UNK token."
             ) from error
 
     def _tokens(self, text: str) -> list[int]:

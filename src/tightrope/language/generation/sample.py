@@ -158,7 +158,9 @@ def meets_stop(rows: list[list[int]], tokenizer: PreTrainedTokenizerBase, stop: 
     size = max(len(text.encode()) for text in stop) + 8
     texts = tokenizer.batch_decode([row[-size:] for row in rows], skip_special_tokens=True)
     ids = special_stops(tokenizer, stop)
-    return [row[-1] in ids or any(word in text for word in stop) for row, text in zip(rows, texts, strict=True)]
+    return [
+        row[-1] in ids or any(word in text for word in stop) for row, text in zip(rows, texts, strict=True)
+    ]
 
 
 def texts_of(
