@@ -200,6 +200,34 @@ def test_the_advice_names_every_reward_with_its_weight(tmp_path, values, monkeyp
     assert str(refused.value).endswith(typed.partition("run ")[2])
 
 
+@pytest.mark.parametrize(
+    ("was", "given", "same"),
+    [
+        (("length=0.5",), "length=0.5", True),
+        (("length=0.5",), ["length"], False),
+        (("length",), ["length=0.1"], False),
+        (("<letters>",), letters, True),
+        (("<letters>",), (letters, 0.5), False),
+        (("<letters>=0.5",), (letters, 0.5), True),
+        (("<letters>",), "judge.py:letters", True),
+        (("<letters>",), "length", False),
+        (("length",), letters, False),
+        (("judge.py:good", "length=2"), ["moved/judge.py:good", ("length", 2)], True),
+        (("judge.py:good", "length=2"), ["judge.py:good"], False),
+        (("judge.py:good", "length=2"), ["length=2", "judge.py:good"], False),
+        (("judge.py:good",), "judge.py:bad", False),
+        (("runs/gone=2",), ["elsewhere/reward=2"], True),
+    ],
+)
+def test_a_run_goes_on_with_the_rewards_and_weights_that_it_has(was, given, same):
+    settings = AlignSettings(data="x.txt", reward=was)
+    if same:
+        alignment._require_what_no_file_gives("run", settings, PROMPTS, given, None)
+        return
+    with pytest.raises(ValueError, match="The reward of run was .*with the same weights"):
+        alignment._require_what_no_file_gives("run", settings, PROMPTS, given, None)
+
+
 def test_other_prompts_and_less_than_was_done_are_refused(tmp_path, values, whole):
     run = tmp_path / "run"
     shutil.copytree(whole.path, run)

@@ -17,7 +17,7 @@ from tightrope.language.data.examples import FILES, Rows
 from tightrope.language.model.architecture import ROUTER_UNUSED, router_weight
 from tightrope.language.model.load import quiet_libraries
 from tightrope.language.reward.judge import RewardSources
-from tightrope.language.settings import AlignSettings, may_stand_in_a_file, recorded, typed_again
+from tightrope.language.settings import AlignSettings, may_stand_in_a_file, recorded, typed_again, weighted
 from tightrope.language.supervised.prepare import threads
 from tightrope.runs import signals
 from tightrope.runs.folders import require_kind
@@ -116,7 +116,8 @@ def resume_align(
     uninterrupted run, bit for bit.
 
     Code is never named by a file: a reward that was a function must be given again, and so must prompts that
-    were no file. ``total_episodes`` extends a finished run.
+    were no file. ValueError where they are seen to be others, or to weigh otherwise. ``total_episodes``
+    extends a finished run.
     """
     with Run.open(run_dir, own=True) as run:
         require_kind(run.path, run.settings, "align")
@@ -141,7 +142,9 @@ def _require_what_no_file_gives(
     for name, value in (("reward", reward), ("gold", gold)):
         known = getattr(settings, name) or ()
         words = (known,) if isinstance(known, str) else known
-        if value is None and not all(map(may_stand_in_a_file, words)):
+        if value is not None:
+            _require_same(run_dir, settings, name, value)
+        elif not all(map(may_stand_in_a_file, words)):
             raise ValueError(
                 f"The {name} of {run_dir} was {' '.join(map(repr, words))}: code, which no file may import, "
                 "or a folder that is not there any more. If it is yours, or you have read it, name it again: "
@@ -153,6 +156,29 @@ def _require_what_no_file_gives(
             f"The prompts of {run_dir} were {settings.data!r}, which is not a file. Give them again: "
             f"tightrope resume {shlex.quote(str(run_dir))} --data PROMPTS.jsonl"
         )
+
+
+def _require_same(run_dir: str | Path, settings: AlignSettings, name: str, value: RewardSources) -> None:
+    """ValueError for judges that are seen to be others than the run's: another number, other weights, another
+    built-in one or function of a file. Of an object or a folder, which may have moved, the weight is seen.
+    """
+    known, given = (getattr(one, name) or () for one in (settings, recorded(settings, **{name: value})))
+    was, now = ((words,) if isinstance(words, str) else tuple(words) for words in (known, given))
+    pairs = [(weighted(old), weighted(new)) for old, new in zip(was, now, strict=False)]
+    if len(was) != len(now) or not all(old[1] == new[1] and _may_be(old[0], new[0]) for old, new in pairs):
+        raise ValueError(
+            f"The {name} of {run_dir} was {', '.join(was) or 'none'}, got {', '.join(now)}; a run keeps what "
+            "it is trained on and judged by: expected the same, in the same order, with the same weights. "
+            f"For another, start a new run: tightrope align --model {shlex.quote(str(run_dir))}"
+        )
+
+
+def _may_be(old: str, new: str) -> bool:
+    """Whether two names may be those of one judge."""
+    if {old, new} & set(AlignSettings.BUILT_IN_REWARDS):
+        return old == new
+    functions = [word.rpartition(":")[2] for word in (old, new) if ".py:" in word]
+    return len(functions) < 2 or functions[0] == functions[1]
 
 
 def _go_back(trainer: Trainer, run: Run, total_episodes: int | None) -> None:
