@@ -526,6 +526,14 @@ def test_a_long_chat_loses_its_beginning_with_a_message():
     ]
 
 
+@pytest.mark.parametrize("template", ["$A", "<bos> $A"])
+def test_a_long_chat_keeps_the_opening_that_its_template_writes(template):
+    made = opening(template)
+    made.chat_template = "<bos>" + CHATML.replace("<bos>", "")
+    (chat,) = read_prompts([{"prompt": CHAT[:2]}], made, max_tokens=12, notify=str)
+    assert made.decode(list(chat.tokens)) == "<bos>\nassistant."
+
+
 @pytest.mark.parametrize(
     ("row", "message"),
     [

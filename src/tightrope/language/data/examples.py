@@ -352,7 +352,8 @@ def read_prompts(
             if shown[-1].isspace():
                 blank += encoder.text(shown + encoder.probe)[: len(tokens)] != tokens
         else:
-            tokens, opening = encoder.prompt(shown, place, tools=columns.get("tools")), []
+            tokens = encoder.prompt(shown, place, tools=columns.get("tools"))
+            opening = encoder.opening_of(tokens)[: max_tokens - 1]
         encoder.require_known(tokens, f"prompt of {place}")
         if not tokens:
             raise ValueError(f"prompt of {place} has no tokens. Take the row out, or fill it in.")

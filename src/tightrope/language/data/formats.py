@@ -68,6 +68,15 @@ class Encoder:
         tokens = self.bare(text)
         return tokens if tokens[: len(self.opening)] == self.opening else [*self.opening, *tokens]
 
+    def opening_of(self, tokens: list[int]) -> list[int]:
+        """What of a chat's tokens opens it: the tokenizer's opening, or the BOS, where the template writes it
+        there and nowhere else. In some chats the BOS opens every turn.
+        """
+        bos = self.tokenizer.bos_token_id
+        opening = self.opening or ([] if bos is None else [bos])
+        begins = bool(opening) and tokens[: len(opening)] == opening
+        return opening if begins and tokens.count(opening[0]) == opening.count(opening[0]) else []
+
     def with_replies(self, text: str, replies: Spans, place: str, encode: Encode) -> tuple[list[int], Spans]:
         """The tokens of a whole text, and where its replies stand in them; ``replies``: spans of characters.
 
