@@ -11,6 +11,7 @@ import torch
 from language.tiny import saved, tiny_gpt2, tiny_llama, tiny_of, tokenizer
 
 from tightrope.algorithms.descent import CheckedSteps
+from tightrope.language.alignment.align import align
 from tightrope.language.data.batching import pad_left, pad_right
 from tightrope.language.data.examples import Pair, preference_pairs
 from tightrope.language.model import lora
@@ -456,3 +457,41 @@ def test_other_peoples_reward_models_have_no_shift(tmp_path):
 
 def test_a_pair_is_as_long_as_its_longer_text():
     assert longest(Pair((1, 2), (1, 2, 3), 1)) == longest(Pair((1, 2, 3), (1, 2), 1)) == 3
+
+
+def as_reward(folder, positions: int = 96, bias: int = 0) -> str:
+    """A reward model of others, in the format of transformers."""
+    from safetensors.torch import load_file, save_file
+
+    made = tiny_of("GPT2", "SequenceClassification", num_labels=1, max_position_embeddings=positions)
+    made.save_pretrained(folder)
+    tokenizer().save_pretrained(folder)
+    if bias:
+        tensors = load_file(folder / "model.safetensors")
+        tensors = {**tensors, "score.bias": torch.zeros(bias)}
+        save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
+    return str(folder)
+
+
+def test_a_bias_of_several_numbers_is_refused(tmp_path):
+    load_reward(as_reward(tmp_path / "one", bias=1))
+    with pytest.raises(ValueError, match=r"two holds score.bias with 2 numbers; expected one"):
+        load_reward(as_reward(tmp_path / "two", bias=2))
+
+
+def test_a_reward_model_of_a_shorter_context_is_refused_before_the_run(tmp_path):
+    judge, model = as_reward(tmp_path / "judge", positions=16), saved(tmp_path / "model")
+    values = {
+        "prompts": ["abcdefgh"],
+        "total_episodes": 8,
+        "batch_size": 8,
+        "lora_rank": 2,
+        "max_new_tokens": 4,
+    }
+    message = (
+        "max_prompt_tokens 13 [+] max_new_tokens 4 exceed the context of the reward model .*judge, 16 tokens"
+    )
+    with pytest.raises(ValueError, match=message):
+        align(model=model, reward=judge, run_dir=tmp_path / "run", max_prompt_tokens=13, **values)
+    assert not (tmp_path / "run").exists()
+    align(model=model, reward=judge, run_dir=tmp_path / "run", max_prompt_tokens=12, **values)

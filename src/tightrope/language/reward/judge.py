@@ -16,6 +16,7 @@ from tightrope.algorithms.descent import OutOfMemory, is_out_of_memory
 from tightrope.language.data.examples import Prompt
 from tightrope.language.generation.sample import Completions, texts_of
 from tightrope.language.model import lora
+from tightrope.language.model.architecture import context_length
 from tightrope.language.model.load import HEAD, known_ids, read_metadata, weights_fingerprint
 from tightrope.language.model.packaged import not_on_hub
 from tightrope.language.model.trunk import Role
@@ -229,6 +230,7 @@ def make_judge(reward: RewardSources, roles: Roles, *, on_trunk: Path | None, ti
             else:
                 model = load_reward(entry.folder).to(roles.settings.device)
                 _same_tokens(model, roles, entry.folder)
+                _require_context(model, roles.settings, entry.folder)
         elif isinstance(entry.given, str):
             functions.append((load_reward_function(entry.given), entry.weight))
         elif callable(entry.given):
@@ -241,6 +243,15 @@ def make_judge(reward: RewardSources, roles: Roles, *, on_trunk: Path | None, ti
     alone = model is None and adapter is None
     rewards = Rewards(functions, timeout=timeout, alone=alone) if functions else None
     return Judge(roles, rewards, model, adapter, model_weight)
+
+
+def _require_context(model: RewardModel, settings: AlignSettings, folder: Path) -> None:
+    limit, longest = context_length(model.base), settings.max_prompt_tokens + settings.max_new_tokens
+    if limit is not None and longest > limit:
+        raise ValueError(
+            f"max_prompt_tokens {settings.max_prompt_tokens} + max_new_tokens {settings.max_new_tokens} "
+            f"exceed the context of the reward model {folder}, {limit} tokens. Choose less of either."
+        )
 
 
 def _same_tokens(model: RewardModel, roles: Roles, folder: Path) -> None:

@@ -160,5 +160,10 @@ def _take_bias(head: nn.Linear, path: Path) -> float:
         with safe_open(file, "pt") as tensors:
             if BIAS in set(tensors.keys()):
                 bias = tensors.get_tensor(BIAS)
+    if bias is not None and bias.numel() != 1:
+        raise ValueError(
+            f"{path} holds {BIAS} with {bias.numel()} numbers; expected one, as its head gives one score. "
+            "Export the reward model again."
+        )
     head.register_parameter("bias", None)
     return 0.0 if bias is None else float(bias.detach())
