@@ -74,7 +74,23 @@ class Hidden(Counts):
         return observation, reward + self.box.n, *rest
 
 
+class Late(Counts):
+    """Makes its counter in its first step."""
+
+    def __init__(self, env: gym.Env) -> None:
+        gym.Wrapper.__init__(self, env)
+
+    def reset(self, **keywords: Any) -> Any:
+        return self.env.reset(**keywords)
+
+    def step(self, action: Any) -> Any:
+        self.won = getattr(self, "won", 0) + 1
+        observation, _, *rest = self.env.step(action)
+        return observation, float(self.won), *rest
+
+
 TASKS = {
+    "made in a step": (lambda: Late(gym.make("CartPole-v1")), "0.won?", "yes"),
     "plain": (lambda: gym.make("CartPole-v1"), "", "yes"),
     "normalised": (
         lambda: wrap.NormalizeReward(wrap.NormalizeObservation(gym.make("CartPole-v1"))),
@@ -244,6 +260,37 @@ def test_what_a_file_cannot_hold_as_it_is_or_is_too_much_is_not_carried(kept):
     assert states.differing(used, Kept(None, None)) == []
     with pytest.raises(TypeError, match=r"0\.kept holds (a|more)"):
         states.take(used, ["0.kept"])
+
+
+def test_an_attribute_that_one_copy_lacks_is_carried_both_ways():
+    used, fresh = Kept(0, None), Kept(0, None)
+    used.won, fresh.first = np.arange(2), True
+    names = states.differing(used, fresh)
+    assert names == ["0.won?", "0.first?"] and not states.not_there(fresh, names)
+    begin, later = (json.loads(json.dumps(states.take(env, names))) for env in (fresh, used))
+    fresh.reset = None  # what lacks nothing is not reset
+    states.give(fresh, begin, 0)
+    del fresh.reset
+    fresh.change = lambda env: None
+    states.give(fresh, later, 0)
+    assert fresh.won.tolist() == [0, 1] and not hasattr(fresh, "first")
+    states.give(fresh, begin, 0)
+    assert fresh.first and not hasattr(fresh, "won")
+
+
+def test_a_run_whose_look_failed_is_told_so_at_the_resume(tmp_path, monkeypatch):
+    def fails(environments: Any) -> Any:
+        raise ValueError("it fails")
+
+    monkeypatch.setattr("tightrope.control.repetition.carried_attributes", fails)
+    make = lambda: Kept(0, lambda env: None)  # noqa: E731
+    settings = resolve(make, "ppo", {**VALUES, "vector_backend": "serial", "total_steps": 400})
+    train.train(settings, run_dir=tmp_path / "run", env=make)
+    said: list[str] = []
+    train.resume(tmp_path / "run", env=make, total_steps=800, listeners=[lambda e: said.append(str(e))])
+    assert len([line for line in said if "could not look what its task keeps" in line]) == 1
+    written = json.loads((tmp_path / "run" / "settings.json").read_text())
+    assert (written["carried"], written["repeats"]) == (None, "untested")
 
 
 @pytest.mark.parametrize("grown", [[0.0] * 1000, {1, 2}], ids=["long", "set"])

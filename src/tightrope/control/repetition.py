@@ -94,11 +94,20 @@ class Repetition:
         self._steps = 0  # of all tests
 
     def begin(self) -> None:
-        """Before the first episode: which attributes have to be carried."""
+        """Before the first episode: which attributes have to be carried. New copies, at a resume, would tell
+        nothing where that was not found: their episodes repeat without what the earlier ones had left.
+        """
         environments, settings = self.agent.environments, self.agent.settings
         if not environments.makers:  # a vector version
             self._next = 0
         elif environments.replays and settings.carried is None:
+            if self.agent.steps:
+                self.listeners.warn(
+                    "This run could not look what its task keeps from one episode to the next; its copies "
+                    "begin again without it, and whether episodes repeat is not tested."
+                )
+                self._next = 0
+                return
             try:
                 found = carried_attributes(environments)
             except ValueError as error:

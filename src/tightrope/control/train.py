@@ -193,8 +193,7 @@ class AgentLearner:
     def begin(self) -> list[str]:
         """Make the environments for evaluation; the lines that describe engine and environments."""
         self._begin = (self.position, self.seconds)
-        if not self.position:
-            self._repetition.begin()
+        self._repetition.begin()
         if self.settings.evaluate_every is not None:
             self._open_evaluation()
         environments = self.agent.environments

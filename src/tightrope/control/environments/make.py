@@ -124,7 +124,7 @@ def _require_layers(names: list[str], layers: int) -> None:
     """ValueError for a name in ``carried`` that is no LAYER.ATTRIBUTE of an environment of so many layers."""
     for name in names:
         layer, _, attribute = name.partition(".")
-        if not (layer.isdecimal() and attribute.isidentifier() and int(layer) < layers):
+        if not (layer.isdecimal() and attribute.removesuffix("?").isidentifier() and int(layer) < layers):
             here = f"there are {layers} here" if layers else "vector environments have none"
             raise ValueError(
                 f"carried has {name!r}; expected LAYER.ATTRIBUTE, where layer 0 is the outermost wrapper and "

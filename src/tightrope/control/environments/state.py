@@ -160,7 +160,8 @@ class _CartPoles:
 
 # Either the environment gives its state, or ``names`` lists attributes: "0.counter" of the outermost layer,
 # "1.obs_rms" of the one inside it. `differing` finds them in a used copy beside a fresh one. Files hold
-# values only; the objects that take them are those of the environment.
+# values only; the objects that take them are those of the environment. An attribute that only one of the two
+# copies has differs too: its name ends in "?", and that it is absent is carried like a value.
 
 # layers that start over at every reset, and attributes that say nothing about an episode
 RESET = (
@@ -205,8 +206,7 @@ def take(env: EnvObject, names: Sequence[str]) -> Any:
     """What an environment carries, as JSON. TypeError for what no file can hold as it is, or is too much."""
     if not names:
         return encode(saved_state(env))
-    found = {name: _attribute(env, name) for name in names}
-    return encode({name: _portable(value, name) for name, value in found.items() if value is not ABSENT})
+    return encode({name: _portable(_attribute(env, name), name) for name in names})
 
 
 def give(env: EnvObject, carried: object, seed: int) -> None:
@@ -219,36 +219,40 @@ def give(env: EnvObject, carried: object, seed: int) -> None:
             env.reset(seed=seed)
         restore_state(env, found)
         return
-    if any(_attribute(env, name) is ABSENT for name in found):
+    # what cannot be held any more has no text, and is replaced too
+    other = {name: form for name, form in found.items() if _text(_attribute(env, name)) != str(encode(form))}
+    if any(_attribute(env, name) is ABSENT for name in other):
         env.reset(seed=seed)
-    for name, form in found.items():
-        held, attribute = vars(_layer(env, name)), name.partition(".")[2]
-        # what cannot be held any more has no text, and is replaced too
-        if attribute not in held or _text(_layer(env, name), attribute) != str(encode(form)):
-            held[attribute] = _built(held.get(attribute), form)
+    for name, form in other.items():
+        held, attribute = vars(_layer(env, name)), _attribute_name(name)
+        held[attribute] = _built(held.get(attribute), form)
+        if held[attribute] is ABSENT:
+            del held[attribute]
 
 
 def not_there(env: EnvObject, names: Sequence[str]) -> list[str]:
-    """Those of ``names`` that an environment, which has been reset, does not have."""
-    return [name for name in names if _attribute(env, name) is ABSENT]
+    """Those of ``names`` that an environment, which has been reset, should have and does not."""
+    return [name for name in names if not name.endswith("?") and _attribute(env, name) is ABSENT]
 
 
 def differing(used: EnvObject, fresh: EnvObject) -> list[str]:
     """Attributes of plain values in which two copies differ."""
     pairs = enumerate(zip(nested(used), nested(fresh), strict=True))
     return [
-        f"{depth}.{name}"
+        f"{depth}.{name}" + "?" * ((name in vars(a)) != (name in vars(b)))
         for depth, (a, b) in pairs
         if type(a).__name__ not in RESET
-        for name in vars(a)
-        if name not in SILENT and (text := _text(a, name)) and text != _text(b, name)
+        for name in vars(a) | vars(b)
+        if name not in SILENT
+        and (text := _text(vars(a).get(name, ABSENT)))
+        and text != _text(vars(b).get(name, ABSENT))
     ]
 
 
-def _text(layer: object, name: str) -> str:
+def _text(value: object) -> str:
     """An attribute as text to compare; empty when it holds no plain values, or too many."""
     try:
-        return str(encode(_portable(vars(layer)[name], name)))
+        return str(encode(_portable(value, "")))
     except (TypeError, RecursionError):
         return ""
 
@@ -258,7 +262,11 @@ def _layer(env: EnvObject, name: str) -> Any:
 
 
 def _attribute(env: EnvObject, name: str) -> Any:
-    return vars(_layer(env, name)).get(name.partition(".")[2], ABSENT)
+    return vars(_layer(env, name)).get(_attribute_name(name), ABSENT)
+
+
+def _attribute_name(name: str) -> str:
+    return name.partition(".")[2].removesuffix("?")
 
 
 def _portable(value: Any, place: str, left: list[int] | None = None) -> Any:
@@ -270,6 +278,8 @@ def _portable(value: Any, place: str, left: list[int] | None = None) -> Any:
     if left[0] < 0:
         raise TypeError(f"{place} holds more than a task may keep from one episode to the next")
     kind = type(value)
+    if value is ABSENT:
+        return ["absent"]
     if kind in KEPT_AS_IS or (isinstance(value, np.generic) and value.dtype.kind in ARRAY_KINDS):
         return value
     if kind is np.ndarray and value.dtype.kind in ARRAY_KINDS:
@@ -298,6 +308,8 @@ def _built(old: Any, form: Any) -> Any:
     if not isinstance(form, list):
         return form
     match form:
+        case ["absent"]:
+            return ABSENT
         case ["scalar array", value]:
             return value.reshape(())
         case ["list", items]:
