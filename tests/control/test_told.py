@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import warnings
 from pathlib import Path
@@ -212,6 +213,32 @@ def test_the_limit_comes_from_what_training_saw_and_is_the_same_after_loading(tm
     assert limit(timed) == 1000
     timed.environments.max_episode_steps = 5_000
     assert limit(timed) == 5_000
+
+
+def test_a_best_that_was_cut_is_replaced_under_a_larger_limit(tmp_path: Path, monkeypatch: Any) -> None:
+    """Each step costs 1, and an episode has 30 steps: the first limit makes it seem cheap."""
+
+    class Costs(Goal):
+        def step(self, action: Any) -> Any:
+            observation, _, *rest = super().step(action)
+            return observation, -1.0, *rest
+
+    make = lambda: Costs(30)  # noqa: E731
+    bests = []
+    for limit, steps in ((10, 64), (10, 128), (20, 192), (40, 256), (50, 320)):
+        monkeypatch.setattr("tightrope.control.train.step_limit", lambda *_, limit=limit: limit)
+        values = {**SMALL, "total_steps": steps, "evaluate_every": 1.0}
+        if steps == 64:
+            train(resolve(make, "ppo", values), run_dir=tmp_path / "run", env=make)
+        else:
+            resume(tmp_path / "run", env=make, total_steps=steps)
+        bests.append(load_steps(tmp_path / "run" / "best"))
+    assert bests == [64, 64, 192, 256, 256]
+
+
+def load_steps(folder: Path) -> int:
+    with contextlib.closing(tightrope.load(folder, env=Goal)) as agent:
+        return agent.steps
 
 
 def test_where_nothing_is_cut_the_limit_changes_nothing() -> None:

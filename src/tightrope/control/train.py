@@ -157,6 +157,7 @@ class AgentLearner:
         self.seconds = 0.0
         self.pending: Update | None = None
         self.best = -math.inf
+        self.best_limit = math.inf  # steps that cut an episode of the best evaluation; infinite: none was cut
         self.final: dict[str, float] = {}
         self._told_of_long_episodes = False
         self._repetition = Repetition(agent, run, listeners)
@@ -271,8 +272,9 @@ class AgentLearner:
         if (text := cut_text(result, limit)) and not self._told_of_cuts:
             self._told_of_cuts = True
             self.listeners.warn(f"{text} Later evaluations tell it as eval/cut_episodes.")
-        if result["mean_return"] > self.best:
-            self._keep(result["mean_return"])
+        # whole episodes return the same under every limit, one that was cut another under a larger one
+        if result["mean_return"] > self.best or limit > self.best_limit:
+            self._keep(result["mean_return"], limit if result["cut_episodes"] else math.inf)
         found = {
             "eval/mean_reward": result["mean_return"],
             "eval/std_reward": result["std_return"],
@@ -285,7 +287,7 @@ class AgentLearner:
             found["eval/success_rate"] = result["success_rate"]
         return found
 
-    def _keep(self, mean: float) -> None:
+    def _keep(self, mean: float, limit: float) -> None:
         """Save the policy as the best. If it cannot be written, the one before stays the best."""
         self.run.require_there()
         try:
@@ -296,7 +298,7 @@ class AgentLearner:
                 f"The best policy is not saved: {error.what} {error.advice}. Training continues."
             )
         else:
-            self.best = mean
+            self.best, self.best_limit = mean, limit
 
     def snapshot(self) -> tuple[Tensors, dict[str, Any]]:
         """The agent, the best evaluation, and the episodes that are running where they can be continued."""
@@ -313,7 +315,8 @@ class AgentLearner:
                 f"An episode is longer than replay_limit {self.settings.replay_limit:,}: it goes on, but a "
                 "resume begins a new one in that copy, and its end has other bits than without a break."
             )
-        return tensors, {**state, "best": self.best, "wall_seconds": self.seconds}
+        best = {"best": self.best, "best_limit": self.best_limit}
+        return tensors, {**state, **best, "wall_seconds": self.seconds}
 
     def restore(self, point: Checkpoint) -> None:
         """Put back a checkpoint. CheckpointError when it is not what an agent of these settings saved."""
@@ -324,6 +327,8 @@ class AgentLearner:
                 raise ValueError(f"its steps are {self.position}, its name says {step_of(point.folder)}")
             best = point.state.get("best")
             self.best = -math.inf if best is None else float(best)
+            limit = point.state.get("best_limit")
+            self.best_limit = math.inf if limit is None else float(limit)
             self.seconds = float(point.state.get("wall_seconds", 0.0))
             lines = self.agent.begin_episodes()
         for line in lines:
