@@ -142,6 +142,19 @@ def test_successes_of_evaluations(tmp_path: Path) -> None:
     assert rate == 0.5
 
 
+@pytest.mark.parametrize(("lengths", "rate"), [((5, 20), 0.5), ((20, 20), 0.0)])
+def test_an_evaluation_episode_that_is_cut_is_a_failure(lengths: tuple[int, int], rate: float) -> None:
+    class Wins(Goal):
+        def step(self, action: Any) -> Any:
+            return *super().step(action)[:4], {"is_success": True}
+
+    copies = [lambda length=length: Wins(length) for length in lengths]
+    agent = tightrope.PPO(Wins, **SMALL).learn(64)
+    with contextlib.closing(agent), make_environments(gym.vector.SyncVectorEnv(copies)) as environments:
+        found = evaluate_agent(agent, environments, 4, max_steps=10)
+    assert (found["cut_episodes"], found["success_rate"]) == (4 - 4 * rate, rate)
+
+
 def test_a_success_that_is_no_number_is_named() -> None:
     class Odd(Goal):
         def step(self, action: Any) -> Any:

@@ -249,8 +249,8 @@ _TABLE = (
         "eval/success_rate",
         "fraction",
         "up",
-        'Share of successes among the evaluation episodes with info["is_success"] in their last step; '
-        "absent: none had it.",
+        'Share of successes among the evaluation episodes with info["is_success"] in their last step, and of '
+        "those that were cut, which are failures; absent: none had it.",
         low=0.0,
         high=1.0,
     ),

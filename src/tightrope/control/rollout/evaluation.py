@@ -38,7 +38,8 @@ def evaluate_agent(
     Every copy plays its own fixed share of the episodes, so that short episodes are not counted more often
     than long ones. One that has not ended after ``max_steps`` counts as it stands, and its copy waits for the
     others: then all are reset. Gives ``mean_return``, ``std_return``, ``ci95`` (half width), ``mean_length``,
-    ``episodes``, ``returns``, ``cut_episodes``, and where episodes tell (masks.py), ``success_rate``.
+    ``episodes``, ``returns``, ``cut_episodes``, and where episodes tell (masks.py), ``success_rate``, in
+    which a cut one is a failure.
     The global generators start from ``seed``, and continue afterwards as if nothing had been drawn.
     """
     with generators.apart(seed):
@@ -84,11 +85,10 @@ def _evaluated(
             again = np.random.SeedSequence([seed, int(share.sum())]).generate_state(1)[0] >> 2
             inputs, action_mask = environments.reset(int(again))
             totals[:], lengths[:], waits[:] = 0.0, 0, False
-    return _summary(found) | {"cut_episodes": cut} | _rate(successes)
-
-
-def _rate(successes: list[float]) -> dict[str, float]:
-    return {"success_rate": float(np.mean(successes))} if successes else {}
+    if cut and (successes or agent.episodes.tell_success):  # what was cut did not reach its goal in time
+        successes += [0.0] * cut
+    rate = {"success_rate": float(np.mean(successes))} if successes else {}
+    return _summary(found) | {"cut_episodes": cut} | rate
 
 
 def _summary(found: list[tuple[float, int]]) -> dict[str, Any]:

@@ -227,6 +227,11 @@ class FinishedEpisodes:
             found["rollout/success_rate"] = float(np.mean(self._successes))
         return found
 
+    @property
+    def tell_success(self) -> bool:
+        """Whether one of the last RECENT episodes said if it reached its goal."""
+        return bool(self._successes)
+
     def state(self) -> dict[str, Any]:
         """What `restore` needs, as JSON."""
         longest = self.longest if math.isfinite(self.longest) else None
