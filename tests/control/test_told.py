@@ -228,6 +228,17 @@ def test_the_limit_comes_from_what_training_saw_and_is_the_same_after_loading(tm
     assert limit(timed) == 5_000
 
 
+def test_the_time_limit_of_a_wrapper_is_the_limit() -> None:
+    make = lambda: gym.wrappers.TimeLimit(gym.wrappers.TimeLimit(Goal(0), 2_500), 3_000)  # noqa: E731
+    agent = tightrope.PPO(make, **SMALL)
+    with contextlib.closing(agent):
+        assert step_limit(agent.settings, agent.environments, 0) == 2_500
+    assert resolve(make, "reinforce", {}).num_steps == 7_500
+    short = gym.wrappers.TimeLimit(gym.make("CartPole-v1"), 40)  # the spec says 500
+    with make_environments(short) as environments:
+        assert environments.max_episode_steps == 40
+
+
 def test_a_best_that_was_cut_is_replaced_under_a_larger_limit(tmp_path: Path, monkeypatch: Any) -> None:
     """Each step costs 1, and an episode has 30 steps: the first limit makes it seem cheap."""
 

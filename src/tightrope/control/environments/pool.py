@@ -60,7 +60,7 @@ from tightrope.control.environments.processes import (
     start_context,
 )
 from tightrope.control.environments.state import gives_state, nested
-from tightrope.control.environments.tasks import close_environment, make_all
+from tightrope.control.environments.tasks import close_environment, make_all, time_limit
 from tightrope.control.environments.watchdog import Watchdog, limited
 from tightrope.control.spaces.actions import action_layout
 from tightrope.control.spaces.observations import observation_layout
@@ -141,7 +141,7 @@ class EnvironmentPool(Environments):
     def _describe(self, envs: list[gym.Env]) -> None:
         spec = envs[0].spec
         self.spec_id = spec.id if spec is not None else type(envs[0].unwrapped).__name__
-        self.max_episode_steps = getattr(spec, "max_episode_steps", None)
+        self.max_episode_steps = time_limit(envs[0])
         self.keywords = {} if spec is None else dict(spec.kwargs)
         self.observation_layout = observation_layout(
             envs[0].observation_space, self.reading.encoder, self.reading.keys

@@ -14,8 +14,10 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.wrappers import TimeLimit
 
 from tightrope.control.environments.faults import RAISED, EnvironmentTimeout, fault_while, raised_here
+from tightrope.control.environments.state import nested
 
 # namespace or entry point module -> the module that must be there, and our extra that installs it
 EXTRAS = {
@@ -55,8 +57,12 @@ def name_of(env: EnvSource) -> str:
 def time_limit(env: EnvSource, keywords: Mapping[str, Any] | None = None) -> int | None:
     """The steps after which an id or an environment object truncates an episode; None: none, or unknown.
 
-    ``keywords``: for gym.make, which takes another limit.
+    An object's TimeLimit layers say it, else its spec. ``keywords``: for gym.make, which takes another limit.
     """
+    if isinstance(env, gym.Env):
+        limits = [layer._max_episode_steps for layer in nested(env) if isinstance(layer, TimeLimit)]
+        if limits:
+            return min(limits)
     if keywords and "max_episode_steps" in keywords:
         return keywords["max_episode_steps"]
     spec = find_spec(env) if isinstance(env, str) else getattr(env, "spec", None)
