@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -134,6 +135,35 @@ def test_recording(control: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         record_run(control, out=tmp_path / "second.mp4")
     with unchanged(), pytest.raises(ValueError, match="not a run folder|no .*checkpoint|no run"):
         record_run(tmp_path / "nothing")
+
+
+class Grows(gym.Env):
+    """Its frames change their size after two steps."""
+
+    observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Discrete(2)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    render_mode = "rgb_array"
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        return np.zeros(1, np.float32), 1.0, self.t == 5, False, {}
+
+    def render(self) -> Any:
+        return np.zeros((32, 32 if self.t < 2 else 48, 3), np.uint8)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs tightrope[video]")
+def test_frames_that_change_their_size_are_refused(tmp_path: Path) -> None:
+    with contextlib.closing(tightrope.PPO(Grows, num_envs=1, num_steps=16, minibatch_size=16)) as agent:
+        agent.save(tmp_path / "agent")
+    with pytest.raises(ValueError, match="48 x 32 pixels after a frame of 32 x 32"):
+        record_run(tmp_path / "agent", env=Grows, out=tmp_path / "film" / "a.mp4")
+    assert not list((tmp_path / "film").iterdir())
 
 
 @pytest.fixture(scope="module")

@@ -124,7 +124,7 @@ def _play(agent: Agent, task: gym.Env, target: Path, episodes: int, seed: int) -
 
     fps = int(task.metadata.get("render_fps") or DEFAULT_FPS)
     temporary = target.with_name(f".{target.name}.part.mp4")
-    writer, returns, frames = None, [], 0
+    writer, size, returns, frames = None, (0, 0), [], 0
     try:
         for episode in range(episodes):
             observation, info = task.reset(seed=seed + episode)
@@ -137,6 +137,11 @@ def _play(agent: Agent, task: gym.Env, target: Path, episodes: int, seed: int) -
                     size = (frame.shape[1], frame.shape[0])
                     writer = imageio_ffmpeg.write_frames(str(temporary), size, fps=fps, macro_block_size=2)
                     writer.send(None)
+                if (frame.shape[1], frame.shape[0]) != size:
+                    raise ValueError(
+                        f"{agent.settings.env} rendered {frame.shape[1]} x {frame.shape[0]} pixels after a "
+                        f"frame of {size[0]} x {size[1]}; a video needs one size; let render() keep it."
+                    )
                 writer.send(np.ascontiguousarray(frame))
                 frames += 1
                 action, _ = agent.predict(observation, action_masks=masks.read(observation, info))
@@ -147,6 +152,8 @@ def _play(agent: Agent, task: gym.Env, target: Path, episodes: int, seed: int) -
         if writer is not None:
             writer.close()
         task.close()
+        if len(returns) < episodes:
+            temporary.unlink(missing_ok=True)
     temporary.replace(target)
     return returns, frames
 
