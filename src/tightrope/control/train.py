@@ -315,8 +315,8 @@ class AgentLearner:
                 f"An episode is longer than replay_limit {self.settings.replay_limit:,}: it goes on, but a "
                 "resume begins a new one in that copy, and its end has other bits than without a break."
             )
-        best = {"best": self.best, "best_limit": self.best_limit}
-        return tensors, {**state, **best, "wall_seconds": self.seconds}
+        own = {"best": self.best, "best_limit": self.best_limit, "wall_seconds": self.seconds}
+        return tensors, {**state, **own}
 
     def restore(self, point: Checkpoint) -> None:
         """Put back a checkpoint. CheckpointError when it is not what an agent of these settings saved."""
@@ -325,9 +325,8 @@ class AgentLearner:
             self.agent.restore(point.tensors, point.state)
             if self.position != step_of(point.folder):
                 raise ValueError(f"its steps are {self.position}, its name says {step_of(point.folder)}")
-            best = point.state.get("best")
+            best, limit = point.state.get("best"), point.state.get("best_limit")
             self.best = -math.inf if best is None else float(best)
-            limit = point.state.get("best_limit")
             self.best_limit = math.inf if limit is None else float(limit)
             self.seconds = float(point.state.get("wall_seconds", 0.0))
             lines = self.agent.begin_episodes()

@@ -85,7 +85,7 @@ def _evaluated(
             again = np.random.SeedSequence([seed, int(share.sum())]).generate_state(1)[0] >> 2
             inputs, action_mask = environments.reset(int(again))
             totals[:], lengths[:], waits[:] = 0.0, 0, False
-    if cut and (successes or agent.episodes.tell_success):  # what was cut did not reach its goal in time
+    if cut and (successes or agent.episodes.successes):  # what was cut did not reach its goal in time
         successes += [0.0] * cut
     rate = {"success_rate": float(np.mean(successes))} if successes else {}
     return _summary(found) | {"cut_episodes": cut} | rate

@@ -190,7 +190,7 @@ class FinishedEpisodes:
 
     def __init__(self) -> None:
         self._newest: deque[tuple[float, int]] = deque(maxlen=RECENT)  # return, length
-        self._successes: deque[float] = deque(maxlen=RECENT)
+        self.successes: deque[float] = deque(maxlen=RECENT)
         self.longest: float = 0
         self._heard: int | None = 0  # when an episode last finished; None: it was told that none does
 
@@ -215,7 +215,7 @@ class FinishedEpisodes:
         """Count the episodes of a rollout; the metrics of these and of the last RECENT ones."""
         here = [(episode[0], episode[1]) for episode in rollout.episodes]
         self._newest.extend(here)
-        self._successes.extend(rollout.successes)
+        self.successes.extend(rollout.successes)
         self.longest = max([self.longest, *(length for _, length in here)])
         found = {"rollout/episodes": float(len(here))}
         for name, episodes in (("ep", self._newest), ("new_ep", here)):
@@ -223,19 +223,14 @@ class FinishedEpisodes:
                 found[f"rollout/{name}_rew_mean"], found[f"rollout/{name}_len_mean"] = np.mean(
                     episodes, axis=0
                 ).tolist()
-        if self._successes:
-            found["rollout/success_rate"] = float(np.mean(self._successes))
+        if self.successes:
+            found["rollout/success_rate"] = float(np.mean(self.successes))
         return found
-
-    @property
-    def tell_success(self) -> bool:
-        """Whether one of the last RECENT episodes said if it reached its goal."""
-        return bool(self._successes)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs, as JSON."""
         longest = self.longest if math.isfinite(self.longest) else None
-        return {"newest": list(self._newest), "successes": list(self._successes), "longest": longest}
+        return {"newest": list(self._newest), "successes": list(self.successes), "longest": longest}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Put back a `state`; an empty one is that of an older version."""
@@ -247,5 +242,5 @@ class FinishedEpisodes:
             raise ValueError("a return or a success of the finished episodes is not finite")
         self._newest.clear()
         self._newest.extend(newest)
-        self._successes.clear()
-        self._successes.extend(successes)
+        self.successes.clear()
+        self.successes.extend(successes)
