@@ -385,6 +385,7 @@ class Agent:
         environments = self.environments
         return {
             "observations": structure(environments.observation_layout.space),
+            "images": environments.observation_layout.pictures(),
             "actions": structure(environments.action_layout.space),
             "action bounds": bounds_of(environments.action_layout.space),
         }
@@ -395,8 +396,8 @@ class Agent:
         for name, here in self._spaces().items():
             if isinstance(saved, dict) and saved.get(name, here) != here:
                 raise ValueError(
-                    f"The saved policy was trained on {name} {saved.get(name)}; this environment has {here}. "
-                    "Give an environment with the same spaces."
+                    f"The saved policy was trained on {name} {saved.get(name)}; this environment has {here}: "
+                    f"{self.environments.observation_layout.space}. Give an environment with the same spaces."
                 )
 
     def restore(self, tensors: Tensors, state: dict[str, Any]) -> None:

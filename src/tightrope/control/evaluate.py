@@ -17,7 +17,7 @@ from tightrope.control.rollout.evaluation import (
     step_limit,
 )
 from tightrope.control.saving import load
-from tightrope.control.settings import EVALUATION_SEED
+from tightrope.control.settings import EVALUATION_SEED, TrainSettings
 
 
 def evaluate_run(
@@ -38,6 +38,10 @@ def evaluate_run(
     ``max_steps`` in the result: where an episode is cut, None where nothing cuts it; ``evaluation_max_steps``
     None: as in training.
     """
+    if type(episodes) is not int or episodes < 1:
+        raise ValueError(f"episodes is {episodes!r}, expected a whole number from 1 on.")
+    if evaluation_max_steps is not None:
+        TrainSettings().with_values(evaluation_max_steps=evaluation_max_steps)  # refuses the same values
     agent = load(
         path, env=env, env_kwargs=env_kwargs, policy=policy, best=best, device=device, engine="torch"
     )  # nothing is learnt

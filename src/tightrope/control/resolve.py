@@ -64,14 +64,23 @@ def anywhere(settings: TrainSettings, env: EnvSource, **values: Any) -> TrainSet
     """
     import gymnasium as gym
 
-    same = env == settings.env or (callable(env) and not isinstance(env, gym.Env))
-    kept = settings.env_kwargs if same else None
+    from tightrope.control.environments.tasks import name_of, require_keywords
+    from tightrope.control.environments.vector import is_vector_env
+
+    made = isinstance(env, gym.Env) or is_vector_env(env)
+    kept = settings.env_kwargs if name_of(env) == settings.env and not made else None
+    if kept and settings.env == "<lambda>":  # they share a name: one that does not take them is another
+        try:
+            require_keywords(env, kept)
+        except ValueError:
+            kept = None
     return dataclasses.replace(settings, vector_backend="auto", num_workers=None, env_kwargs=kept, **values)
 
 
 def _describe(env: EnvSource, values: dict[str, Any]) -> tuple[str, int | None]:
     """``discrete``, ``continuous`` or ``images``, and the time limit, of a task that no preset lists."""
     from tightrope.control.environments.copies import makers_of
+    from tightrope.control.environments.faults import RAISED, fault_while
     from tightrope.control.environments.tasks import (
         close_environment,
         make_all,
@@ -95,10 +104,13 @@ def _describe(env: EnvSource, values: dict[str, Any]) -> tuple[str, int | None]:
         if made and made[0] is not env:
             stack.callback(close_environment, made[0], 0, limit)
         task: Any = made[0] if made else env
-        vector = hasattr(task, "single_observation_space")
-        space = task.single_observation_space if vector else task.observation_space
-        observations = observation_layout(space, given.encoder, given.observation_keys)
-        actions = action_layout(task.single_action_space if vector else task.action_space)
+        prefix = "single_" if is_vector_env(task) else ""
+        try:  # properties are code of the environment too
+            found = [getattr(task, f"{prefix}{name}_space") for name in ("observation", "action")]
+        except RAISED as error:
+            raise fault_while("Asking for the spaces of", 0, error) from error
+        observations = observation_layout(found[0], given.encoder, given.observation_keys)
+        actions = action_layout(found[1])
         steps = time_limit(env if isinstance(env, str) else task, given.env_kwargs)
     if observations.images:
         return "images", steps
@@ -170,7 +182,7 @@ def without_effect(settings: TrainSettings, actions: ActionLayout, *, own_policy
         reasons |= dict.fromkeys(("std", "log_std_init", "action_bounds"), "the task has no Box action")
     if own_policy:
         reasons |= dict.fromkeys(("hidden", "activation", "shared"), "the policy is a module of your own")
-    return settings.without_effect() + [
+    return settings.without_effect(usual) + [
         f"{name} has no effect: {reason}."
         for name, reason in reasons.items()
         if all(getattr(settings, name) != values.get(name, ...) for values in usual)

@@ -33,7 +33,8 @@ def load(
     """The agent of a run folder (its newest policy, ``best``: its best) or of a folder that ``save`` wrote.
 
     ``env``: needed when the saved one was no plain Gymnasium id; another id is a warm start.
-    ``env_kwargs``: other arguments for the constructor, beside those of the run that they do not name.
+    ``env_kwargs``: other arguments for the constructor, beside those of the run that they do not name;
+    {}: none.
     ``policy``: needed when the saved policy was a module of your own.  ``engine``: who computes further
     updates (auto, fused, torch); with another ``device`` it is chosen again.
     """
@@ -50,20 +51,22 @@ def load(
             f"{path} holds a policy module of your own. Pass it again: load({str(path)!r}, policy=module)."
         )
     if env is None and own_environment:
-        again = name_again(path, settings.env, "evaluate")
-        raise ValueError(f"{again}\nIn Python: load({str(path)!r}, env=...)")
+        python = f"load({str(path)!r}, env=...)"
+        raise ValueError(name_again(path, settings.env, "evaluate", python, bool(state["own_environment"])))
     if env is not None:
         name = env if isinstance(env, str) else settings.env
         rows = env.num_envs if is_vector_env(env) else settings.num_envs
         settings = anywhere(settings, env, num_envs=rows).with_values(env=name)
     if env_kwargs:
         settings = settings.with_values(env_kwargs={**(settings.env_kwargs or {}), **env_kwargs})
+    elif env_kwargs is not None:
+        settings = settings.with_values(env_kwargs=None)
     agent = rebuild(settings.env if env is None else env, path, policy=policy, settings=settings)
     try:
         agent.require_spaces(state)
         with checkpoint.understood(folder):
             agent.restore(tensors, state)
-        if env_kwargs or (env is not None and not own_environment):
+        if env_kwargs is not None or (env is not None and not own_environment):
             agent.forget_episodes()  # a warm start on another task
     except BaseException:
         agent.close()
@@ -71,13 +74,22 @@ def load(
     return agent
 
 
-def name_again(path: str | Path, env: str, command: str) -> str:
-    """The command to type for a run whose task is the user's code: a file must not name what is imported."""
+def name_again(path: str | Path, env: str, command: str, python: str, made: bool) -> str:
+    """What to type for a run whose task is the user's code: a file must not name what is imported.
+
+    ``made``: the task was an object or a factory, whose wrappers and arguments no id tells.
+    """
+    if made:
+        return (
+            f"{path} was trained on an environment or a factory that was given in Python, called {env!r}. An "
+            f"id alone is not the whole task: its wrappers would be missing. If it is yours, "
+            f"name it again in Python:\n{python}"
+        )
     registered = "" if ":" in env else " --env-module FILE.py"
     words = f"tightrope {command} {shlex.quote(str(path))} --env {retyped(env, 'ID')}{registered}"
     return (
         f"{path} was trained on {env!r}, a task of somebody's own code, which no file may import. If it is "
-        f"yours, or you have read it, name it again:\n{words}"
+        f"yours, or you have read it, name it again:\n{words}\nIn Python: {python}"
     )
 
 

@@ -88,7 +88,7 @@ class TrainSettings(Settings):
         "Processes to spread the copies over; with mixed this one is one of them. none: one a core.",
         at_least=1,
         at_most=1024,
-        needs={"vector_backend": ("auto", "workers")},
+        needs={"vector_backend": ("auto", "mixed", "workers")},
     )
     engine: str = setting(
         "auto",

@@ -113,7 +113,10 @@ def _resume(
             f"tightrope.load({str(run_dir)!r}{', env=...' if own_environment else ''}).learn(n)."
         )
     if env is None and own_environment:
-        raise ValueError(name_again(run_dir, settings.env, "resume"))
+        python = f"resume({str(run_dir)!r}, env=...)"
+        raise ValueError(
+            name_again(run_dir, settings.env, "resume", python, bool(state.get("own_environment")))
+        )
     if own_policy and policy is None:
         raise ValueError(
             f"{run_dir} holds a policy module of somebody's own, which no file may import. Continue in "

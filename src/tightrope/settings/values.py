@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -41,8 +41,11 @@ class Settings:
             changed["update"] = dataclasses.replace(update, **inner) if isinstance(update, rule) else update
         return dataclasses.replace(self, **changed)
 
-    def without_effect(self) -> list[str]:
-        """Which settings were changed and do nothing, for lack of the values of others that they need."""
+    def without_effect(self, usual: Sequence[Mapping[str, object]] = ()) -> list[str]:
+        """Which settings were changed and do nothing, for lack of the values of others that they need.
+
+        ``usual``: values that nobody chose beside the defaults, those of presets.
+        """
         update = getattr(self, "update", None)
         owners = [self, update] if isinstance(update, Settings) else [self]
         flat = {
@@ -51,7 +54,8 @@ class Settings:
         found = []
         for field in (field for owner in owners for field in dataclasses.fields(owner)):
             value = flat[field.name]
-            if not field.init or value == field.default:
+            nobodys = (field.default, *(values[field.name] for values in usual if field.name in values))
+            if not field.init or value in nobodys:
                 continue
             for other, useful in field.metadata.get("needs", {}).items():
                 if other not in flat:  # of another update rule

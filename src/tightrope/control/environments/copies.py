@@ -47,7 +47,8 @@ Found = dict[str, tuple[Any, Any]]
 def makers_of(env: EnvSource, num_envs: int, keywords: Mapping[str, object] | None = None) -> list[Maker]:
     """One function per copy of an id, an instance (it is copy 0 itself) or a factory.
 
-    ``keywords``: for the constructor. ValueError: something else, or keywords that cannot be given.
+    ``keywords``: for the constructor; each call gets a copy of its own, which it may change.
+    ValueError: something else, or keywords that cannot be given.
     """
     keywords = dict(keywords or {})
     if isinstance(env, gym.Env):
@@ -59,10 +60,10 @@ def makers_of(env: EnvSource, num_envs: int, keywords: Mapping[str, object] | No
         return replicas(env, num_envs)
     if isinstance(env, str):
         require_keywords(env, keywords)
-        return [lambda: make_by_id(env, **keywords)] * num_envs
+        return [lambda: make_by_id(env, **copy.deepcopy(keywords))] * num_envs
     if callable(env):
         require_keywords(env, keywords)
-        return [functools.partial(env, **keywords) if keywords else env] * num_envs
+        return [(lambda: env(**copy.deepcopy(keywords))) if keywords else env] * num_envs
     raise ValueError(
         f"env is a {type(env).__name__}; expected a Gymnasium id, an environment, a zero-argument "
         "factory or a vector environment."

@@ -275,13 +275,14 @@ class EnvGroup:
         buffers, plain, shape, checked = self.buffers, self._plain, self._shape, self._checked
         envs, rewards, flat_rows, current = self.envs, buffers.rewards, self._flat_rows, buffers.current
         has_masks, strict, dtype = self.has_masks, self.policy.restart, self._dtype
+        may_tell = has_masks or not self.action_layout.num_logits  # of a mask, if only one with no use
         row = begin
         try:
             for row, action in zip(range(begin, len(self.envs)), actions, strict=False):
                 current[0] = row
                 result = envs[row].step(action)
                 if not checked:
-                    _check_step(result, has_masks)
+                    _check_step(result, may_tell)
                 observation, reward, terminated, truncated, info = result
                 if not (
                     type(terminated) in FLAG_TYPES
@@ -289,7 +290,7 @@ class EnvGroup:
                     and type(reward) in REWARD_TYPES
                     and type(info) is dict
                 ):  # numpy would store most of these all the same
-                    _check_step(result, has_masks)
+                    _check_step(result, may_tell)
                 rewards[row] = reward
                 if strict:
                     check_finite("reward", rewards[row])
@@ -469,7 +470,7 @@ def _check_reset(result: object) -> tuple[Any, dict[str, Any]]:
     return result
 
 
-def _check_step(result: object, has_masks: bool) -> None:
+def _check_step(result: object, may_tell: bool) -> None:
     """Check a step of an environment. ApiBreak when it does not follow Gymnasium's API."""
     if not isinstance(result, tuple) or len(result) != 5:
         raise ApiBreak(
@@ -485,7 +486,7 @@ def _check_step(result: object, has_masks: bool) -> None:
             raise ApiBreak(f"{name} is {flag!r}, expected True or False")
     if not isinstance(info, dict):
         raise ApiBreak(f"info is {kind_of(info)}, expected a dict")
-    if MASK_KEY in info and not has_masks:
+    if MASK_KEY in info and not may_tell:
         raise ApiBreak(
             f"step gives info[{MASK_KEY!r}] but reset did not; give it at every reset and every step"
         )

@@ -36,11 +36,18 @@ class MaskSource:
         if self.kind == "info":
             if MASK_KEY not in info:
                 raise ApiBreak(MISSING)
-            return info[MASK_KEY]
+            return given(info[MASK_KEY], f"info[{MASK_KEY!r}]")
         if self.kind == "method":
             assert self.method is not None
-            return self.method()
+            return given(self.method(), f"{METHOD}()")
         return observation[MASK_KEY] if self.kind == "observation" else None
+
+
+def given(mask: Any, where: str) -> Any:
+    """The mask; ApiBreak for None."""
+    if mask is None:
+        raise ApiBreak(f"{where} is None, expected 1 or 0 a choice; give ones where everything is allowed")
+    return mask
 
 
 def find_source(

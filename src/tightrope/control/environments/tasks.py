@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import difflib
 import functools
 import importlib
@@ -149,7 +150,7 @@ def make_vector_by_id(env_id: str, num_envs: int, keywords: Mapping[str, Any] | 
 
     def make() -> Any:
         make_vec = functools.partial(
-            gym.make_vec, env_id, num_envs, vectorization_mode="vector_entry_point", **keywords
+            gym.make_vec, env_id, num_envs, vectorization_mode="vector_entry_point", **copy.deepcopy(keywords)
         )
         same_step: dict[str, Any] = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
         if env_id.startswith("ALE/"):

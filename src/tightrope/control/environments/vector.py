@@ -41,6 +41,7 @@ from tightrope.control.environments.masks import (
     NOTHING_ALLOWED,
     SUCCESS_KEY,
     find_source,
+    given,
     vector_success,
 )
 from tightrope.control.environments.tasks import close_environment
@@ -379,12 +380,12 @@ class VectorEnvironments(Environments):
         if not needed.any():
             return masks
         raw = source.read(observations, infos)
-        given = infos.get(f"_{MASK_KEY}") if source.kind == "info" else None  # which rows have one
-        if given is not None and not np.asarray(given)[needed].all():
+        told = infos.get(f"_{MASK_KEY}") if source.kind == "info" else None  # which rows have one
+        if told is not None and not np.asarray(told)[needed].all():
             raise ApiBreak(MISSING)
-        if given is not None and isinstance(raw, np.ndarray) and raw.dtype == object:
-            for row in np.flatnonzero(given):
-                masks[row] = actions.flatten_mask(raw[row], 1)
+        if told is not None and isinstance(raw, np.ndarray) and raw.dtype == object:
+            for row in np.flatnonzero(told):
+                masks[row] = actions.flatten_mask(given(raw[row], MASK_KEY), 1)
         else:
             flat = actions.flatten_mask(raw, self.num_envs)
             assert flat is not None

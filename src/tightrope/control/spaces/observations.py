@@ -28,6 +28,8 @@ from tightrope.control.spaces.structure import (
     walk,
 )
 
+BYTES = (np.uint8, np.bool_)  # what an image keeps as bytes
+MOST_COLUMNS = 2**24  # of flat inputs: their first layer of 64 units alone takes 17 GB with Adam's moments
 SMALLEST_IMAGE = 5  # what the convolutions for small images need
 
 
@@ -83,12 +85,31 @@ class Leaf:
                 f"{self.space!r}"
             )
         target = inputs[self.name]
+        # flat inputs keep any number; bytes, bits and categories would silently become other ones
+        whole = (
+            target.dtype if self.kind == "image" else np.dtype(np.int8 if self.kind == "bits" else np.int64)
+        )
+        if self.kind != "box" and whole.kind in "iu" and not np.can_cast(values.dtype, whole, "safe"):
+            values = self._exact(values, whole)
         if self.kind == "image":
             target[...] = values
         elif self.kind == "one_hot":
             self._write_one_hot(values, target[:, self.columns])
         else:
             target[:, self.columns] = values.reshape(len(values), -1)
+
+    def _exact(self, values: np.ndarray, dtype: np.dtype) -> np.ndarray:
+        """``values`` as whole numbers of ``dtype``; ValueError for one that it cannot hold."""
+        with np.errstate(invalid="ignore"):  # NaN and infinity are among those
+            held = values.astype(dtype)
+        wrong = values[held != values]
+        if wrong.size:
+            raise ValueError(
+                f"observation{place_of(self.path)} holds {wrong[0]!s} as {values.dtype}, which its space "
+                f"{self.space!r} of {self.space.dtype} cannot hold: return such numbers, or declare the "
+                "space of what is returned."
+            )
+        return held
 
     def _write_one_hot(self, values: np.ndarray, target: np.ndarray) -> None:
         indices = values.reshape(len(values), -1).astype(np.int64) - self.starts
@@ -114,16 +135,31 @@ class ObservationLayout:
     has_mask: bool  # the Dict carries the action mask under "action_mask"; it is no input
     plain: bool  # one Box of rank 1: "flat" is the observation itself
     keys: tuple[str, ...] = ()  # of a Dict, those that are used; empty: all
+    encoder: str = "auto"  # what is an image
 
     def fits(self, space: Space) -> bool:
-        """Whether a space, of which only ``keys`` count, has the same parts; their bounds may differ."""
-        return structure(self.space) == structure(selected(space, self.keys))
+        """Whether a space, of which only ``keys`` count, has the same parts, the same of them images; their
+        bounds may differ.
+        """
+        other = selected(space, self.keys)
+        same = structure(self.space) == structure(other)
+        return same and self.pictures() == self.pictures(other)
+
+    def pictures(self, space: Space | None = None) -> list[str]:
+        """Each image among the parts of a space (default: this one), read as here: where it lies, its shape,
+        and whether it is kept as bytes.
+        """
+        return [
+            f"{'bytes' if part.dtype in BYTES else 'numbers'}{place_of(path)}{list(part.shape or ())}"
+            for path, part in walk(self.space if space is None else space, "given")
+            if is_image(part, self.encoder) and path != (MASK_KEY,)
+        ]
 
     def allocate(self, num: int, zeros: Callable[..., np.ndarray] = np.zeros) -> Inputs:
         """Empty inputs for ``num`` observations; ``zeros(shape, dtype)`` makes the arrays."""
         inputs = {"flat": zeros((num, self.size), np.float64)} if self.size else {}
         for leaf in self.images:
-            of_bytes = leaf.space.dtype in (np.uint8, np.bool_)
+            of_bytes = leaf.space.dtype in BYTES
             shape = (num, *(leaf.space.shape or ()))
             inputs[leaf.name] = zeros(shape, np.uint8 if of_bytes else np.float32)
         return inputs
@@ -205,6 +241,14 @@ class ObservationLayout:
         return nest(self.space, iter(parts), skip_mask=self.has_mask)
 
 
+def _is_mask(space: Space) -> bool:
+    """Whether the values of a space can be 0 or 1 a choice."""
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        counts, starts = categories(space)
+        return bool((counts == 2).all() and (starts == 0).all())
+    return isinstance(space, spaces.Box | spaces.MultiBinary)
+
+
 def observation_layout(space: Space, encoder: str = "auto", keys: tuple[str, ...] = ()) -> ObservationLayout:
     """The layout of an observation space; ``encoder``: what is an image (see `is_image`). ``keys``: of a
     Dict, those that are used (empty: all).
@@ -214,7 +258,12 @@ def observation_layout(space: Space, encoder: str = "auto", keys: tuple[str, ...
     """
     space = selected(space, keys)
     mask_space = space.spaces.get(MASK_KEY) if isinstance(space, spaces.Dict) else None
-    has_mask = isinstance(mask_space, spaces.Box | spaces.MultiBinary)
+    has_mask = mask_space is not None
+    if mask_space is not None and not _is_mask(mask_space):
+        raise ValueError(
+            f"observation[{MASK_KEY!r}] has the space {mask_space!r}; an action mask holds 0 or 1 a choice: "
+            "expected a Box, a MultiBinary, or a MultiDiscrete of 2s. If it is no mask, give it another name."
+        )
     leaves: list[Leaf] = []
     continuous: list[bool] = []
     images: list[Leaf] = []
@@ -226,11 +275,17 @@ def observation_layout(space: Space, encoder: str = "auto", keys: tuple[str, ...
         kind: Literal["box", "bits", "one_hot", "image"] = "box"
         if isinstance(part, spaces.Discrete | spaces.MultiDiscrete):
             kind, (counts, starts) = "one_hot", categories(part)
-            width = int(counts.sum())
+            width = sum(counts.tolist())  # Python's integers: an int64 may overflow
         elif isinstance(part, spaces.MultiBinary):
             kind = "bits"
         elif is_image(part, encoder):
             kind, name, width = "image", f"image{len(images)}", 0
+        if offset + width > MOST_COLUMNS:
+            raise ValueError(
+                f"observation{place_of(path)} of the space {part!r} becomes {width:,} inputs, which no "
+                f"memory holds; expected at most {MOST_COLUMNS:,} in all. A Discrete is one input a "
+                "category: declare large numbers as a Box."
+            )
         leaves.append(Leaf(path, part, kind, name, slice(offset, offset + width), counts, starts))
         images += leaves[-1:] if kind == "image" else []
         continuous += [kind == "box"] * width
@@ -256,6 +311,7 @@ def observation_layout(space: Space, encoder: str = "auto", keys: tuple[str, ...
         ),
         has_mask=has_mask,
         keys=keys,
+        encoder=encoder,
         plain=len(leaves) == 1
         and leaves[0].path == ()
         and leaves[0].kind == "box"
