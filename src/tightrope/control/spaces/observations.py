@@ -241,12 +241,22 @@ class ObservationLayout:
         return nest(self.space, iter(parts), skip_mask=self.has_mask)
 
 
-def _is_mask(space: Space) -> bool:
-    """Whether the values of a space can be 0 or 1 a choice."""
-    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        counts, starts = categories(space)
-        return bool((counts == 2).all() and (starts == 0).all())
-    return isinstance(space, spaces.Box | spaces.MultiBinary)
+def _has_mask(space: Space) -> bool:
+    """Whether a Dict carries an action mask; ValueError for a part of that name that can be none."""
+    part = space.spaces.get(MASK_KEY) if isinstance(space, spaces.Dict) else None
+    if part is None:
+        return False
+    if isinstance(part, spaces.Discrete | spaces.MultiDiscrete):
+        counts, starts = categories(part)
+        good = bool((counts == 2).all() and (starts == 0).all())
+    else:
+        good = isinstance(part, spaces.Box | spaces.MultiBinary)
+    if not good:
+        raise ValueError(
+            f"observation[{MASK_KEY!r}] has the space {part!r}; an action mask holds 0 or 1 a choice: "
+            "expected a Box, a MultiBinary, or a MultiDiscrete of 2s. If it is no mask, give it another name."
+        )
+    return True
 
 
 def observation_layout(space: Space, encoder: str = "auto", keys: tuple[str, ...] = ()) -> ObservationLayout:
@@ -257,13 +267,7 @@ def observation_layout(space: Space, encoder: str = "auto", keys: tuple[str, ...
     image.
     """
     space = selected(space, keys)
-    mask_space = space.spaces.get(MASK_KEY) if isinstance(space, spaces.Dict) else None
-    has_mask = mask_space is not None
-    if mask_space is not None and not _is_mask(mask_space):
-        raise ValueError(
-            f"observation[{MASK_KEY!r}] has the space {mask_space!r}; an action mask holds 0 or 1 a choice: "
-            "expected a Box, a MultiBinary, or a MultiDiscrete of 2s. If it is no mask, give it another name."
-        )
+    has_mask = _has_mask(space)
     leaves: list[Leaf] = []
     continuous: list[bool] = []
     images: list[Leaf] = []
