@@ -85,7 +85,7 @@ def test_settings_beyond_what_can_be_are_named(values: dict[str, Any], words: st
         ({"gsde_steps": 4}, "gsde_steps 4 has no effect: std is independent, and it needs gsde"),
         (
             {"num_workers": 2, "vector_backend": "serial"},
-            "num_workers 2 has no effect: vector_backend is serial, and it needs auto or workers",
+            "num_workers 2 has no effect: vector_backend is serial, and it needs auto or mixed or workers",
         ),
         ({"max_env_restarts": 3}, "max_env_restarts 3 has no effect: on_env_fault is raise"),
         (

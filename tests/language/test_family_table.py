@@ -24,6 +24,9 @@ def third() -> list[str]:
     return [kind for kind in fast[::3] if kind in table.families()]
 
 
+@pytest.mark.filterwarnings(
+    "ignore:.*adapter. PEFT:UserWarning"
+)  # what PEFT cannot open is told, not refused
 @pytest.mark.parametrize("kind", third())
 def test_a_family_is_right_or_refused_in_a_sentence(kind, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

@@ -15,7 +15,7 @@ Encode = Callable[[str], list[int]]
 Spans = list[tuple[int, int]]  # begin and end, of characters or of tokens
 # what a text may stand behind, so that it gets the tokens of a continuation; then words of the vocabulary
 ANCHORS = ("", "\n", ".", "a", " a")
-TRIED = 256  # words of a vocabulary
+WORDS_TRIED = 256  # of a vocabulary
 
 
 class Encoder:
@@ -61,7 +61,7 @@ class Encoder:
         """Texts of the first ordinary tokens of the vocabulary."""
         special = set(self.tokenizer.all_special_ids)
         words = (self._decoded([token]) for token in range(len(self.tokenizer)) if token not in special)
-        return islice((word for word in words if word.strip()), TRIED)
+        return islice((word for word in words if word.strip()), WORDS_TRIED)
 
     def text(self, text: str) -> list[int]:
         """The tokens of a text with the tokenizer's opening, which is never put there twice."""

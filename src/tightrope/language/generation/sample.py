@@ -180,10 +180,10 @@ def special_stops(tokenizer: PreTrainedTokenizerBase, stop: Sequence[str]) -> se
     """The ids of stop strings that are special tokens, which no text shows. ValueError for a stop string that
     has one beside other text: it would never be met.
     """
-    found = set()
+    found = set[int]()
     for word in stop:
         known = tokenizer.convert_tokens_to_ids(word)
-        if known is not None and tokenizer.convert_ids_to_tokens(known) == word:
+        if isinstance(known, int) and tokenizer.convert_ids_to_tokens(known) == word:
             if not tokenizer.decode([known], skip_special_tokens=True):
                 found.add(known)
             continue

@@ -246,7 +246,8 @@ def make_judge(reward: RewardSources, roles: Roles, *, on_trunk: Path | None, ti
 
 
 def _require_context(model: RewardModel, settings: AlignSettings, folder: Path) -> None:
-    limit, longest = context_length(model.base), settings.max_prompt_tokens + settings.max_new_tokens
+    base: Any = model.base
+    limit, longest = context_length(base), settings.max_prompt_tokens + settings.max_new_tokens
     if limit is not None and longest > limit:
         raise ValueError(
             f"max_prompt_tokens {settings.max_prompt_tokens} + max_new_tokens {settings.max_new_tokens} "
