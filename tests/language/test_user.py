@@ -258,9 +258,7 @@ def test_a_stop_string_ends_a_row_where_its_last_token_completes_it():
     common = max("abcdefghijklmnopqrstuvwxyz", key=lambda c: sum(c in text[1:] for text in plain))
     stop = next(text[i - 1 : i + 1] for text in plain for i in range(5, len(text)) if text[i] == common)
 
-    def met(rows):
-        return meets_stop(rows, words, (stop,))
-
+    met = meets_stop(words, (stop,))
     got = sample(model, tokens, real, Sampling(), numbers, (3,), stops_at=met)
     assert got.stopped is not None and got.stopped.any() and not got.stopped.all()
     for row in range(40):
@@ -293,7 +291,7 @@ def marked():
 def test_a_special_token_that_is_no_eos_may_be_a_stop(tmp_path):
     words, end = marked(), WORDS.index("e")
     row = [WORDS.index("a"), end, WORDS.index("b")]
-    assert meets_stop([row[:1], row[:2]], words, ("<|im_end|>", "x")) == [False, True]
+    assert meets_stop(words, ("<|im_end|>", "x"))([row[:1], row[:2]]) == [False, True]
     assert texts_of(words, [row, row[:1]], ("<|im_end|>", "x")) == ["a", "a"]
     assert texts_of(words, [row], ("x",)) == ["ab"]
     folder = saved(tmp_path / "model")

@@ -377,7 +377,7 @@ def _saved_per_token(found: Parts, linears: list[list[tuple[int, int]]], item: i
     """Bytes per token that the base keeps for a backward pass through all of its weights."""
     try:
         first, second, third = (saved_bytes(found.base, length) for length in LENGTHS)
-    except (RuntimeError, NotImplementedError, ValueError, TypeError, AttributeError, IndexError):
+    except (RuntimeError, ValueError, TypeError, AttributeError, IndexError):
         # layers that must look at numbers, as routed experts do, or a base that takes no mask of four axes
         widest = max(side for layer in linears for pair in layer for side in pair)
         return len(linears) * (12 * found.head.weight.shape[1] + 4 * widest) * item

@@ -54,8 +54,8 @@ class Settings:
         found = []
         for field in (field for owner in owners for field in dataclasses.fields(owner)):
             value = flat[field.name]
-            nobodys = (field.default, *(values[field.name] for values in usual if field.name in values))
-            if not field.init or value in nobodys:
+            unchosen = (field.default, *(values[field.name] for values in usual if field.name in values))
+            if not field.init or value in unchosen:
                 continue
             for other, useful in field.metadata.get("needs", {}).items():
                 if other not in flat:  # of another update rule

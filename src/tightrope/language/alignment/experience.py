@@ -68,7 +68,7 @@ def stops_of(
     tokenizer: PreTrainedTokenizerBase, settings: AlignSettings
 ) -> Callable[[list[list[int]]], list[bool]] | None:
     """What ends a response beside an EOS, as `sample` takes it; None where nothing does."""
-    return functools.partial(meets_stop, tokenizer=tokenizer, stop=settings.stop) if settings.stop else None
+    return meets_stop(tokenizer, settings.stop) if settings.stop else None
 
 
 def respond(roles: Roles, prompts: Sequence[Prompt], seeds: Sequence[int], samples: int) -> Completions:

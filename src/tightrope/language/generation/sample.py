@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
 from tightrope.language.generation.distribution import Sampling, next_logits
-from tightrope.language.model.architecture import accepted, parts
+from tightrope.language.model.architecture import accepted, parts, relative_gap
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel, PreTrainedTokenizerBase
@@ -148,19 +148,25 @@ def sample(
     return Responses(tokens, mask, logp, ended, support, stopped)
 
 
-def meets_stop(rows: list[list[int]], tokenizer: PreTrainedTokenizerBase, stop: Sequence[str]) -> list[bool]:
-    """Of rows of tokens that grow one by one, which have just come to one of the stop strings: their text, or
-    their last token where a stop is a special token.
+def meets_stop(
+    tokenizer: PreTrainedTokenizerBase, stop: Sequence[str]
+) -> Callable[[list[list[int]]], list[bool]]:
+    """A function that finds, of rows of tokens that grow one by one, those that have just come to one of the
+    stop strings: their text, or their last token where a stop is a special token.
 
     Only the end of a row is read: a stop string has no more tokens than bytes; some more, because a tokenizer
     may write the first of a text in another way.
     """
-    size = max(len(text.encode()) for text in stop) + 8
-    texts = tokenizer.batch_decode([row[-size:] for row in rows], skip_special_tokens=True)
-    ids = special_stops(tokenizer, stop)
-    return [
-        row[-1] in ids or any(word in text for word in stop) for row, text in zip(rows, texts, strict=True)
-    ]
+    size, ids = max(len(text.encode()) for text in stop) + 8, special_stops(tokenizer, stop)
+
+    def met(rows: list[list[int]]) -> list[bool]:
+        texts = tokenizer.batch_decode([row[-size:] for row in rows], skip_special_tokens=True)
+        return [
+            row[-1] in ids or any(word in text for word in stop)
+            for row, text in zip(rows, texts, strict=True)
+        ]
+
+    return met
 
 
 def texts_of(
@@ -280,7 +286,7 @@ def _tried(base: nn.Module, vocabulary: int, mask: str) -> bool:
             text, seen = tokens[:, :length], real[:, :length]
             step = next_pass(base, text, seen, step, mask)
             whole = next_pass(base, text, seen, step, "").hidden[:, -1:]
-            gap = float((step.hidden - whole).abs().max() / whole.abs().max())
+            gap = relative_gap(step.hidden, whole)
             if not gap <= (CACHE_TOLERANCE if whole.dtype == torch.float32 else LOWERED_CACHE_TOLERANCE):
                 return False
     except (MemoryError, torch.OutOfMemoryError):

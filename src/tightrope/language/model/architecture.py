@@ -29,6 +29,8 @@ ROUTER_UNUSED = (
     "config.json asks for a router auxiliary loss (output_router_logits). It is not used: {}. Experts may "
     "come to be used unevenly."
 )
+# what layers raise that need other inputs than they are given
+MISFITS = (TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError)
 FACTOR_TOLERANCE = 1e-3  # relative; the same operations twice, and one multiplication
 
 
@@ -249,6 +251,11 @@ def _scale(read: Any, before: Any) -> float | None:
 def _apart(x: Tensor, y: Tensor) -> bool:
     """Whether two tensors differ by more than rounding. NaN is not counted; other checks find it."""
     return bool((x - y).abs().max() > FACTOR_TOLERANCE * y.abs().max())
+
+
+def relative_gap(x: Tensor, y: Tensor) -> float:
+    """max |x - y| as a share of max |y|."""
+    return float((x - y).abs().max() / y.abs().max())
 
 
 def _seen(logits: Tensor, place: float) -> float:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from tightrope.language.data.batching import positions
 from tightrope.language.model import lora
-from tightrope.language.model.architecture import WINDOW_FIELDS, accepted, parts
+from tightrope.language.model.architecture import MISFITS, WINDOW_FIELDS, accepted, parts, relative_gap
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel
@@ -81,7 +81,7 @@ class Trunk:
                 whole = _run(base, real, input_ids=tokens)
                 both = _run(upper, real, inputs_embeds=_run(lower, real, input_ids=tokens))
             self._lower, self._upper = _halves(base, layers, cut)
-        except (TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError):
+        except MISFITS:
             return  # the layers of this architecture need more than the output of the layer before
         if relative_gap(both[real], whole[real]) <= HALVES_TOLERANCE[whole.dtype == torch.float32]:
             self.cut = cut
@@ -129,11 +129,6 @@ class Role:
             return self.trunk.hidden(tokens, real, lower)
         finally:
             switch.active = before
-
-
-def relative_gap(x: Tensor, y: Tensor) -> float:
-    """max |x - y| as a share of max |y|."""
-    return float((x - y).abs().max() / y.abs().max())
 
 
 def _run(base: nn.Module, real: Tensor, **inputs: Tensor) -> Tensor:

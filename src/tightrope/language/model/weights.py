@@ -88,7 +88,7 @@ def _belongs_inside(model: nn.Module, key: str) -> bool:
 
 
 def _common_prefix(missing: list[str], unused: list[str]) -> str:
-    """What every unused name begins with, where one of them goes on with the name of a missing weight."""
+    """The prefix that all unused names share and that, taken off, turns one of them into a missing name."""
     ends = (key.removesuffix(name) for name in missing for key in unused if key.endswith("." + name))
     return next((end for end in ends if all(key.startswith(end) for key in unused)), "")
 

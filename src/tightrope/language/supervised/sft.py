@@ -24,10 +24,12 @@ from tightrope.language.data.batching import (
 from tightrope.language.data.examples import Row, Rows, sft_examples
 from tightrope.language.generation.distribution import Sampling, token_statistics
 from tightrope.language.model.architecture import (
+    MISFITS,
     ROUTER_UNUSED,
     accepted,
     attention_window,
     parts,
+    relative_gap,
     router_weight,
 )
 from tightrope.language.model.load import known_ids
@@ -41,7 +43,6 @@ if TYPE_CHECKING:
     from transformers import PreTrainedModel
 
 PACKED_GAP = 0.05, 1e-3  # relative, in bfloat16 and in float32: a row of two texts sums in another order
-LOOKING_BACK = (TypeError, ValueError, RuntimeError, AttributeError, IndexError, KeyError)
 
 
 def hidden_states(model: PreTrainedModel, rows: Packed) -> Tensor:
@@ -79,11 +80,11 @@ def require_packable(model: PreTrainedModel, longest: int) -> None:
         with torch.no_grad():
             apart = torch.cat([hidden_states(model, row) for row in rows[:2]], 1).float()
         leak, together = _leak(model, rows[2], len(texts[0].tokens))
-    except LOOKING_BACK as error:
+    except MISFITS as error:
         raise ValueError(
             f"--pack with {name}: a row of two texts cannot be computed ({error}). Leave --pack out."
         ) from error
-    gap = float((together.float() - apart).abs().max() / apart.abs().max())
+    gap = relative_gap(together.float(), apart)
     if leak or not gap <= PACKED_GAP[together.dtype == torch.float32]:
         seen = (
             f"the second of two texts in a row depends on the first ({leak:.1e})"
@@ -146,7 +147,7 @@ class RouterLoss:
                     self._pass(row_of([text]).to(model.device))
                 self.weight = weight
                 return
-            except LOOKING_BACK as error:
+            except MISFITS as error:
                 reason = f"{type(model).__name__} gives none ({error})"
         notify(ROUTER_UNUSED.format(reason))
 
